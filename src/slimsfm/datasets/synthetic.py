@@ -1,0 +1,128 @@
+"""Rendered objects in OnePose's layout: a data set with exact poses, made in seconds from a seed."""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from PIL import Image as PilImage
+
+from slimsfm.datasets import onepose
+from slimsfm.files import check_writable, replacing
+from slimsfm.progress import ProgressBar, silent
+from slimsfm.synthetic.objects import OBJECTS
+from slimsfm.synthetic.scene import TAKES, Take, object_box
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesisOptions:
+    """What to render."""
+
+    objects: tuple[str, ...] = tuple(OBJECTS)
+    """Names of objects; all by default."""
+
+    mapping_frames: int = 60
+    """Frames of the video that maps an object: half a minute, two a second."""
+
+    query_frames: int = 40
+    """Frames of the video that asks for poses."""
+
+    width: int = 640
+    """Of an image, in pixels."""
+
+    height: int = 480
+    """Of an image, in pixels."""
+
+    seed: int = 0
+    """Of prints, things around, unsteady hands and noise: equal options give equal bytes."""
+
+    def __post_init__(self) -> None:
+        if (
+            not self.objects
+            or len(set(self.objects)) < len(self.objects)
+            or not OBJECTS.keys() >= set(self.objects)
+        ):
+            raise ValueError(f"objects must be different ones of {', '.join(OBJECTS)}, got {self.objects}")
+        for field in ("mapping_frames", "query_frames", "width", "height"):
+            if getattr(self, field) < 1:
+                raise ValueError(f"{field} must be positive, got {getattr(self, field)}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TakeKey:
+    """All that a take depends on: little enough to send to another process."""
+
+    kind: str
+    name: str
+    frames: int
+    width: int
+    height: int
+    seed: int
+
+
+def synthesize(
+    directory: Path,
+    options: SynthesisOptions = SynthesisOptions(),
+    *,
+    overwrite: bool = False,
+    progress: ProgressBar = silent,
+    executor: Executor | None = None,
+) -> list[onepose.ObjectSequences]:
+    """Render objects and write each as one of OnePose's: `NAME/NAME-1` maps it, `NAME/NAME-2` queries it.
+
+    Args:
+        directory: Where the objects' folders go; made if missing. An object appears when it is complete.
+        options: What to render.
+        overwrite: Replace objects that are there already.
+        progress: Told of each frame.
+        executor: Renders frames elsewhere, such as a `ProcessPoolExecutor`; None renders here, one at a time.
+
+    Returns:
+        The objects as read back, in the order of `options.objects`.
+
+    Raises:
+        OutputError: An object is there already, or the folder cannot be written.
+    """
+    for name in options.objects:
+        check_writable(directory / name, overwrite=overwrite)
+    for name in options.objects:
+        with replacing(directory / name, overwrite=overwrite) as folder:
+            _write_object(folder, name, options, progress, executor)
+    return [onepose.read_object(directory / name) for name in options.objects]
+
+
+def _write_object(
+    folder: Path, name: str, options: SynthesisOptions, progress: ProgressBar, executor: Executor | None
+) -> None:
+    onepose.write_box(folder, object_box(OBJECTS[name](options.seed)))
+    jobs: list[tuple[_TakeKey, int, Path]] = []
+    counts = (options.mapping_frames, options.query_frames)
+    for number, (kind, frames) in enumerate(zip(TAKES, counts, strict=True), start=1):
+        key = _TakeKey(
+            kind=kind, name=name, frames=frames, width=options.width, height=options.height, seed=options.seed
+        )
+        take, sequence = _take(key), folder / f"{name}-{number}"
+        onepose.write_annotation(sequence, take.camera, take.cam_from_object)
+        jobs += [(key, frame, onepose.image_path(sequence, frame)) for frame in range(frames)]
+    _render(jobs, f"rendering {name}", progress, executor)
+
+
+def _render(
+    jobs: Sequence[tuple[_TakeKey, int, Path]], label: str, progress: ProgressBar, executor: Executor | None
+) -> None:
+    done = map(_write_frame, jobs) if executor is None else executor.map(_write_frame, jobs)
+    for _ in progress(jobs, label):
+        next(done)
+
+
+@lru_cache(maxsize=2)
+def _take(key: _TakeKey) -> Take:
+    return TAKES[key.kind](key.name, key.frames, key.width, key.height, key.seed)
+
+
+def _write_frame(job: tuple[_TakeKey, int, Path]) -> None:
+    key, frame, path = job
+    PilImage.fromarray(_take(key).frame(frame)).save(path, compress_level=1)

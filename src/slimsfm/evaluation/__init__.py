@@ -1,0 +1,1 @@
+"""Localizing queries of known pose against maps, and what comes of it."""

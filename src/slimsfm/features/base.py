@@ -1,0 +1,72 @@
+"""What every extractor takes and gives."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32, Int64, Shaped, UInt8
+
+from slimsfm.arrays import Descriptors, GrayImage, Image
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """The local features of one image; row i of each array describes keypoint i."""
+
+    keypoints: Float32[np.ndarray, "n 2"]
+    """Pixels, COLMAP's convention: the centre of the top-left pixel is (0.5, 0.5)."""
+
+    descriptors: Shaped[np.ndarray, "n d"]
+    """As the extractor stores them (bytes or floats); `unit_rows` makes them comparable."""
+
+    scores: Float32[np.ndarray, " n"]
+    """How sure the detector is of each keypoint; larger is surer."""
+
+    image_size: tuple[int, int]
+    """Width and height of the upright image in pixels."""
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def __getitem__(self, rows: Int64[np.ndarray, " k"]) -> "Features":
+        """The features of these rows, in this order."""
+        return Features(
+            keypoints=self.keypoints[rows],
+            descriptors=self.descriptors[rows],
+            scores=self.scores[rows],
+            image_size=self.image_size,
+        )
+
+
+class Extractor(Protocol):
+    """Finds and describes keypoints. Equal images give equal features."""
+
+    @property
+    def name(self) -> str:
+        """The name under which a map remembers its extractor."""
+        ...
+
+    @property
+    def options(self) -> dict:
+        """What `load_extractor` needs to make an equal extractor."""
+        ...
+
+    def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
+        """Find features, none where the mask, of the image's size, is 0. There may be no feature at all."""
+        ...
+
+
+def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
+    """Make descriptors comparable by their dot product: rows of length 1 (a row of zeros stays one)."""
+    rows = descriptors.astype(np.float32)
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.maximum(lengths, np.float32(1e-12))
+
+
+def image_colors(
+    image: UInt8[np.ndarray, "h w 3"], keypoints: Float32[np.ndarray, "n 2"]
+) -> UInt8[np.ndarray, "n 3"]:
+    """The RGB of the pixel that each keypoint lies in."""
+    limits = np.array(image.shape[1::-1]) - 1
+    columns, rows = np.clip(keypoints.astype(np.int64), 0, limits).T
+    return image[rows, columns]

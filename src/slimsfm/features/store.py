@@ -1,0 +1,152 @@
+"""Features and matches on disk, in hloc's HDF5 layout.
+
+`features.h5`: a group an image name with `keypoints` (n, 2), `descriptors` (d, n), `scores` (n) and
+`image_size` (2). `matches.h5`: a group `A/B` a pair of image names ("/" in a name written "-") with
+`matches0` (for each keypoint of A its match in B or -1) and `matching_scores0`.
+
+hloc puts the centre of the top-left pixel at (0, 0), everything else here at (0.5, 0.5). This file alone
+converts.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from slimsfm.arrays import IndexPairs
+from slimsfm.errors import InputError
+from slimsfm.features.base import Features
+
+_PIXEL_CENTER = np.float32(0.5)
+_INT16_MAX = np.iinfo(np.int16).max
+
+
+class FeatureFile(Mapping[str, Features]):
+    """The features of a file by image name, read when asked for; names are sorted.
+
+    Raises:
+        InputError: The file is missing or no such file, at construction; an entry is damaged, at access.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = _open(path)
+        self._path = path
+        self._names = dict.fromkeys(sorted(_groups_with(self._file, "keypoints")))
+
+    def __getitem__(self, name: str) -> Features:
+        if name not in self._names:
+            raise KeyError(name)
+        try:
+            return _read_features(self._file[name])
+        except (KeyError, OSError, ValueError) as error:
+            raise InputError(f"{self._path}: the features of {name!r} are damaged ({error})") from error
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def _read_features(group: h5py.Group) -> Features:
+    keypoints = np.asarray(group["keypoints"], np.float32)
+    descriptors = np.asarray(group["descriptors"]).T
+    if keypoints.ndim != 2 or descriptors.ndim != 2 or len(keypoints) != len(descriptors):
+        raise ValueError(f"{keypoints.shape} keypoints with {descriptors.T.shape} descriptors")
+    scores = np.asarray(group["scores"]) if "scores" in group else np.ones(len(keypoints))
+    width, height = (int(side) for side in group["image_size"]) if "image_size" in group else (0, 0)
+    return Features(
+        keypoints=np.ascontiguousarray(keypoints[:, :2]) + _PIXEL_CENTER,
+        descriptors=np.ascontiguousarray(descriptors),
+        scores=scores.astype(np.float32),
+        image_size=(width, height),
+    )
+
+
+class MatchFile(Mapping[tuple[str, str], IndexPairs]):
+    """The verified matches of a file by pair of image names, read when asked for.
+
+    Each pair has one entry, in the order in which the file names it.
+    """
+
+    def __init__(self, path: Path, names: list[str]) -> None:
+        self._file = _open(path)
+        self._path = path
+        by_key = {_key(name): name for name in names}
+        groups = (group.split("/") for group in _groups_with(self._file, "matches0"))
+        pairs = ((by_key.get(group[0]), by_key.get(group[-1])) for group in groups)
+        self._pairs = sorted((a, b) for a, b in pairs if a is not None and b is not None)
+
+    def __getitem__(self, pair: tuple[str, str]) -> IndexPairs:
+        group = self._file[f"{_key(pair[0])}/{_key(pair[1])}"]
+        targets = np.asarray(group["matches0"], np.int64)
+        rows = np.flatnonzero(targets >= 0)
+        return np.stack([rows, targets[rows]], axis=1)
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+
+class FeatureWriter:
+    """Writes features image by image, so that never all of them are in memory."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = h5py.File(path, "w", libver="latest")
+
+    def __enter__(self) -> "FeatureWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, name: str, features: Features) -> None:
+        """Add the features of one image."""
+        group = self._file.create_group(name)
+        group["keypoints"] = features.keypoints - _PIXEL_CENTER
+        group["descriptors"] = np.ascontiguousarray(features.descriptors.T)
+        group["scores"] = features.scores
+        group["image_size"] = np.array(features.image_size, np.int64)
+
+
+def write_matches(
+    path: Path, matches: Mapping[tuple[str, str], IndexPairs], num_keypoints: Mapping[str, int]
+) -> None:
+    """Write verified matches, in sorted order of the pairs."""
+    with h5py.File(path, "w", libver="latest") as file:
+        for a, b in sorted(matches):
+            pairs = matches[a, b]
+            kind = np.int16 if num_keypoints[b] <= _INT16_MAX else np.int32
+            targets = np.full(num_keypoints[a], -1, kind)
+            targets[pairs[:, 0]] = pairs[:, 1]
+            group = file.create_group(f"{_key(a)}/{_key(b)}")
+            group.create_dataset("matches0", data=targets, compression="gzip", shuffle=True)
+            scores = (targets >= 0).astype(np.float16)
+            group.create_dataset("matching_scores0", data=scores, compression="gzip", shuffle=True)
+
+
+def _open(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: not a readable HDF5 file; it may be cut short") from error
+
+
+def _groups_with(file: h5py.File, dataset: str) -> list[str]:
+    found: list[str] = []
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Group) and dataset in item:
+            found.append(name)
+
+    file.visititems(visit)
+    return found
+
+
+def _key(name: str) -> str:
+    return name.replace("/", "-")

@@ -1,0 +1,76 @@
+"""Writing: a result appears whole or not at all."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from slimsfm.errors import OutputError
+
+
+def check_writable(path: Path, *, overwrite: bool) -> None:
+    """Refuse, before any work is done, an output that exists or has no folder to lie in.
+
+    Raises:
+        OutputError: The output exists and `overwrite` is off, or its parent is not a folder.
+    """
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; choose another output or pass --overwrite")
+    parent = path.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir():
+        raise OutputError(f"{path}: {parent} is not a folder, so nothing can be written there")
+
+
+@contextmanager
+def replacing(path: Path, *, overwrite: bool) -> Iterator[Path]:
+    """Give a temporary path beside `path`, and rename it to `path` when the block ends well.
+
+    The block makes a file or a folder at the temporary path. When it fails or is interrupted, what it wrote
+    is removed and whatever stood at `path` still does.
+
+    Raises:
+        OutputError: The output cannot be written: it exists, or the disk is full or read-only.
+    """
+    check_writable(path, overwrite=overwrite)
+    partial = path.absolute().parent / f".{path.name}.partial"
+    try:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        remove(partial)
+        yield partial
+        _swap(partial, path)
+    except OSError as error:
+        if error.filename is not None and not _within(Path(str(error.filename)), partial):
+            raise  # reading something else failed: not ours to explain
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror or error}); nothing was kept"
+        ) from error
+    finally:
+        remove(partial)
+
+
+def _swap(partial: Path, path: Path) -> None:
+    old = partial.with_suffix(".old")
+    remove(old)
+    if path.exists():
+        path.rename(old)
+    try:
+        partial.rename(path)
+    except OSError:
+        if old.exists():
+            old.rename(path)
+        raise
+    remove(old)
+
+
+def _within(path: Path, partial: Path) -> bool:
+    return path.absolute().is_relative_to(partial.parent)
+
+
+def remove(path: Path) -> None:
+    """Delete a file or folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,114 @@
+"""Boxes, and distances between poses.
+
+A pose is a `pycolmap.Rigid3d` called `cam_from_world`: `x_in_cam = R @ x_in_world + t`.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from slimsfm.arrays import Points2D, Points3D
+
+_SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
+
+BOX_EDGES = tuple((i, j) for i, j in combinations(range(8), 2) if np.sum(_SIGNS[i] != _SIGNS[j]) == 1)
+"""Pairs of corners of a `Box` that its twelve edges join."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An oriented 3D box around an object.
+
+    Corner k is `center` plus or minus each half edge; the signs are the binary digits of k, first edge first.
+    """
+
+    center: Float64[np.ndarray, "3"]
+    """Centre, in the frame and unit of the map."""
+
+    half_edges: Float64[np.ndarray, "3 3"]
+    """Row i runs from the centre to the middle of the i-th face."""
+
+    def __post_init__(self) -> None:
+        values = np.concatenate([self.center, self.half_edges.ravel()])
+        if not np.all(np.isfinite(values)) or self.diagonal <= 0:
+            raise ValueError(f"half_edges must be finite and not all zero, got {self.half_edges.tolist()}")
+
+    @property
+    def corners(self) -> Float64[np.ndarray, "8 3"]:
+        """The eight corners."""
+        return self.center + _SIGNS @ self.half_edges
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the longest diagonal: the `d` of every relative error."""
+        return float(2 * np.linalg.norm(_SIGNS[:4] @ self.half_edges, axis=1).max())
+
+    @classmethod
+    def from_corners(cls, corners: Points3D) -> "Box":
+        """Find the box whose corners, in any order, are the given ones.
+
+        Raises:
+            ValueError: There are not 8 corners, or they are not those of a box (within 1 % of its diagonal).
+        """
+        if corners.shape != (8, 3):
+            raise ValueError(f"corners must be 8 points with 3 coordinates, got shape {corners.shape}")
+        center = corners.mean(axis=0)
+        candidates = [
+            cls(center, np.array([(corners[k] - corners[0]) / 2 for k in others]))
+            for others in combinations(range(1, 8), 3)
+        ]
+        gaps = [_hausdorff(box.corners, corners) for box in candidates]
+        best = candidates[int(np.argmin(gaps))]
+        if not min(gaps) < 0.01 * best.diagonal:
+            raise ValueError("corners must be the 8 corners of a box, but no three edges span the given ones")
+        return best
+
+
+def _hausdorff(a: Points3D, b: Points3D) -> float:
+    distances = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
+
+
+def project(
+    points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
+) -> Float64[np.ndarray, "n 2"]:
+    """Project points into an image, with the camera's distortion; NaN where a point has no image."""
+    return np.asarray(camera.img_from_cam(cam_from_world * points3D_in_world), dtype=np.float64).reshape(
+        -1, 2
+    )
+
+
+def reprojection_errors(
+    points2D: Points2D,
+    points3D_in_world: Points3D,
+    cam_from_world: pycolmap.Rigid3d,
+    camera: pycolmap.Camera,
+) -> Float64[np.ndarray, " n"]:
+    """Distances in pixels between points and where their 3D points project; infinite where they do not."""
+    errors = np.linalg.norm(project(points3D_in_world, cam_from_world, camera) - points2D, axis=1)
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def corner_error(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d, box: Box) -> float:
+    """Mean distance of the box's corners under two poses, over the box's diagonal."""
+    corners = box.corners
+    distances = np.linalg.norm(a_cam_from_world * corners - b_cam_from_world * corners, axis=1)
+    return float(distances.mean() / box.diagonal)
+
+
+def rotation_error_deg(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d) -> float:
+    """Angle of the rotation between two poses, in [0, 180].
+
+    Taken as the angle of a unit quaternion, which is accurate near 0 and 180 degrees, where the arc cosine of
+    the trace is not.
+    """
+    x, y, z, w = (a_cam_from_world.rotation.inverse() * b_cam_from_world.rotation).quat
+    return float(np.degrees(2 * np.arctan2(np.linalg.norm([x, y, z]), abs(w))))
+
+
+def translation_error(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d) -> float:
+    """Distance, in map units, between where two poses put the world's origin before the camera."""
+    return float(np.linalg.norm(a_cam_from_world.translation - b_cam_from_world.translation))

@@ -1,0 +1,5 @@
+"""Localizing query images against a map: load once, localize many."""
+
+from slimsfm.localization.localizer import STRATEGIES, Localization, LocalizationOptions, Localizer, Seconds
+
+__all__ = ["STRATEGIES", "Localization", "LocalizationOptions", "Localizer", "Seconds"]

@@ -1,0 +1,132 @@
+"""From a query image to its pose."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from time import perf_counter
+
+import numpy as np
+import pycolmap
+
+from slimsfm.arrays import Image
+from slimsfm.features import Features, load_extractor, unit_rows
+from slimsfm.localization.strategy import Strategy
+from slimsfm.mapping.map import Map
+from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+
+# Paths, not classes: naming a strategy must not import what it needs.
+STRATEGIES = {
+    "direct": "slimsfm.localization.direct:Direct",
+    "exhaustive": "slimsfm.localization.exhaustive:Exhaustive",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizationOptions:
+    """How queries are localized."""
+
+    strategy: str = "exhaustive"
+    """Match against each reference image (exhaustive) or against the points (direct)."""
+
+    ransac: RansacOptions = RansacOptions()
+    """The pose search."""
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise ValueError(
+                f"strategy must be one of {', '.join(sorted(STRATEGIES))}, got {self.strategy!r}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seconds:
+    """Wall time of each stage."""
+
+    extract: float
+    """Features of the query."""
+
+    match: float
+    """Query against map."""
+
+    pose: float
+    """Pose from matches."""
+
+    @property
+    def total(self) -> float:
+        """All stages."""
+        return self.extract + self.match + self.pose
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Localization:
+    """What became of one query."""
+
+    pose: PoseEstimate | None
+    """Where the camera stood, or None: the query could not be localized."""
+
+    num_matches: int
+    """2D-3D matches that the pose was sought in."""
+
+    seconds: Seconds
+    """Time it took."""
+
+
+class Localizer:
+    """Localizes query images against one map."""
+
+    def __init__(self, map: Map, options: LocalizationOptions = LocalizationOptions()) -> None:
+        self._map = map
+        self._options = options
+        self._extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+        module, attribute = STRATEGIES[options.strategy].split(":")
+        self._strategy: Strategy = getattr(import_module(module), attribute)(map)
+
+    def localize(self, image: Image, camera: pycolmap.Camera | None = None) -> Localization:
+        """Localize one image.
+
+        Args:
+            image: Upright RGB.
+            camera: Its intrinsics; those of the map where all reference images share a camera and the sizes
+                agree up to a common scale.
+
+        Raises:
+            ValueError: No camera is given and the map's cannot stand in, or it is of another size.
+        """
+        camera = camera or self._map_camera(image)
+        if (camera.width, camera.height) != image.shape[1::-1]:
+            raise ValueError(
+                f"camera is of {camera.width}x{camera.height} pixels, the image of {image.shape[1]}x{image.shape[0]}"
+            )
+        start = perf_counter()
+        features = self._extractor.extract(image)
+        return self._localize(features, camera, perf_counter() - start)
+
+    def localize_features(self, features: Features, camera: pycolmap.Camera) -> Localization:
+        """Localize an image by features that its map's extractor gave."""
+        return self._localize(features, camera, 0.0)
+
+    def _localize(self, features: Features, camera: pycolmap.Camera, extract_seconds: float) -> Localization:
+        start = perf_counter()
+        matches = self._strategy.match(unit_rows(features.descriptors))
+        matched = perf_counter()
+        pose = estimate_pose(
+            features.keypoints[matches.keypoints].astype(np.float64),
+            self._map.points3D_in_world[matches.points],
+            camera,
+            self._options.ransac,
+        )
+        seconds = Seconds(extract=extract_seconds, match=matched - start, pose=perf_counter() - matched)
+        return Localization(pose=pose, num_matches=len(matches), seconds=seconds)
+
+    def _map_camera(self, image: Image) -> pycolmap.Camera:
+        shared = self._map.shared_camera
+        if shared is None:
+            raise ValueError("camera must be given: the map's reference images have several")
+        height, width = image.shape[:2]
+        if abs(width * shared.height - height * shared.width) > max(shared.width, shared.height):
+            raise ValueError(
+                f"camera must be given: the image is {width}x{height} pixels, those of the map "
+                f"{shared.width}x{shared.height}"
+            )
+        scaled = pycolmap.Camera(shared.todict())
+        scaled.rescale(width, height)
+        return scaled

@@ -1,0 +1,36 @@
+"""What every way of matching a query against a map takes and gives."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from slimsfm.arrays import Descriptors, Ids, IndexPairs
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointMatches:
+    """Matches between the keypoints of a query and the points of a map; a pair occurs once."""
+
+    keypoints: Ids
+    """Rows of the query's features."""
+
+    points: Ids
+    """Rows of the map's points."""
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+class Strategy(Protocol):
+    """Matches queries against one map. Made once for a map, then called for every query."""
+
+    def match(self, descriptors: Descriptors) -> PointMatches:
+        """Match the query's descriptors, rows of unit length, against the map."""
+        ...
+
+
+def unite(parts: list[IndexPairs]) -> PointMatches:
+    """Join pairs (keypoint, point) from several sources; equal pairs become one. Sorted by keypoint, point."""
+    pairs = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *parts]), axis=0)
+    return PointMatches(keypoints=pairs[:, 0], points=pairs[:, 1])

@@ -1,0 +1,99 @@
+"""The object's box: read from a file, or estimated from the points that the images look at."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from slimsfm.arrays import Ids, Points3D
+from slimsfm.errors import InputError
+from slimsfm.geometry import Box
+
+_ROUNDS = 20  # of trimming; it settles in fewer
+_REACH = 2.5  # points beyond this many standard deviations are background
+_SPREAD = 0.25  # of the Gaussian, over the shorter side of the image
+_TAIL = 0.01  # share of the weight left out at either end of the box
+
+
+def read_box(path: Path) -> Box:
+    """Read a box from JSON (`{"corners": [[x, y, z], ...]}` or the list alone) or `box3d_corners.txt`.
+
+    Raises:
+        InputError: The file is missing, or does not hold the 8 corners of a box.
+    """
+    try:
+        if path.suffix.lower() == ".json":
+            data = json.loads(path.read_text())
+            corners = np.array(data["corners"] if isinstance(data, dict) else data, np.float64)
+        else:
+            corners = np.loadtxt(path, dtype=np.float64, ndmin=2)
+        return Box.from_corners(corners)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such box file") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: should hold the 8 corners of a box, a line or list of x y z each ({error})"
+        ) from error
+
+
+def estimate_box(model: pycolmap.Reconstruction) -> Box:
+    """Estimate the box of what the images look at.
+
+    A point counts by how often, and how near the middle of an image, it is seen; what lies far out, by the
+    counts' own mean and covariance, is background and trimmed until nothing changes. The box is aligned with
+    the principal axes of what remains and holds all but 1 % of the count at each of its six sides.
+
+    Where masks were used, features and so points lie on the object alone, and the same rule holds.
+    """
+    ids = sorted(model.point3D_ids())
+    points = np.array([model.point3D(i).xyz for i in ids], np.float64).reshape(-1, 3)
+    weights = _centrality(model, np.array(ids, np.int64))
+    inside = np.ones(len(points), dtype=bool)
+    for _ in range(_ROUNDS):
+        mean, covariance = _moments(points[inside], weights[inside])
+        offsets = points - mean
+        squared = np.einsum("ni,ij,nj->n", offsets, np.linalg.inv(covariance), offsets)
+        kept = squared < _REACH**2
+        if np.array_equal(kept, inside):
+            break
+        inside = kept
+    return _box_around(points[inside], weights[inside])
+
+
+def _centrality(model: pycolmap.Reconstruction, ids: Ids) -> Float64[np.ndarray, " n"]:
+    """For each point the sum over its observations of a Gaussian of their distance to the image's centre."""
+    weights = np.zeros(len(ids))
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        seen = image.get_observation_points2D()
+        pixels = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
+        size = np.array([image.camera.width, image.camera.height])
+        squared = (((pixels - size / 2) / (_SPREAD * size.min())) ** 2).sum(axis=1)
+        rows = np.searchsorted(ids, np.array([point.point3D_id for point in seen], np.int64))
+        weights[rows] += np.exp(-squared / 2)
+    return weights + 1e-12
+
+
+def _moments(points: Points3D, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    mean = np.average(points, axis=0, weights=weights)
+    covariance = np.cov(points.T, aweights=weights)
+    return mean, covariance + 1e-12 * (np.trace(covariance) + 1e-30) * np.eye(3)
+
+
+def _box_around(points: Points3D, weights: np.ndarray) -> Box:
+    mean, covariance = _moments(points, weights)
+    axes = np.linalg.eigh(covariance)[1].T
+    axes *= np.where(axes[np.arange(3), np.abs(axes).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
+    coordinates = (points - mean) @ axes.T
+    low, high = np.array([_weighted_range(coordinates[:, i], weights) for i in range(3)]).T
+    half = np.maximum((high - low) / 2, 1e-3 * (high - low).max())
+    return Box(mean + (low + high) / 2 @ axes, half[:, None] * axes)
+
+
+def _weighted_range(values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(weights[order]) / weights.sum()
+    low, high = np.searchsorted(share, (_TAIL, 1 - _TAIL))
+    return float(values[order[low]]), float(values[order[min(high, len(order) - 1)]])

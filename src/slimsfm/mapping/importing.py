@@ -1,0 +1,227 @@
+"""An existing COLMAP model to map: the model stays as it is, its keypoints get their descriptors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from slimsfm.arrays import IndexPairs
+from slimsfm.errors import InputError, ModelError
+from slimsfm.features import Features
+from slimsfm.features.store import FeatureFile, MatchFile
+from slimsfm.mapping.box import estimate_box, read_box
+from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.model import read_model
+from slimsfm.mapping.redescribe import redescribe
+from slimsfm.mapping.sfm import verified_matches
+from slimsfm.progress import ProgressBar, silent
+
+_MIN_INLIERS = 15  # matches of a verified pair, as COLMAP has it
+_MAX_EPIPOLAR_ERROR_PX = 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """Where the descriptors of a model's keypoints come from: exactly one of the first three."""
+
+    database: Path | None = None
+    """The model's COLMAP database. If nothing is given, a database.db beside the model is looked for."""
+
+    features: Path | None = None
+    """hloc's features.h5."""
+
+    images: Path | None = None
+    """Folder of the model's images: SIFT descriptors are computed at the model's keypoints."""
+
+    matches: Path | None = None
+    """hloc's matches.h5, to go with `features`."""
+
+    extractor: str = "sift"
+    """Name of the extractor that made `features`; queries are extracted with it."""
+
+    box: Path | None = None
+    """The object's box: JSON or OnePose's box3d_corners.txt. Without it the box is estimated."""
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("database", "features", "images") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)}: give just one source of descriptors")
+        if self.matches is not None and self.features is None:
+            raise ValueError("matches needs features, the keypoints that it speaks of")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Source:
+    """Descriptors, and matches where there are any, from one of the possible sources."""
+
+    features: Mapping[str, Features]
+    matches: Mapping[tuple[str, str], IndexPairs]
+    extractor: str
+    extractor_options: dict
+    origin: str
+
+
+def import_model(
+    model_path: Path, options: ImportOptions = ImportOptions(), progress: ProgressBar = silent
+) -> Map:
+    """Make a map of a COLMAP model, binary or text, with or without rigs and frames.
+
+    Ids, names, cameras, poses and points stay as they are.
+
+    Raises:
+        ModelError: The model is damaged, or its keypoints are not those of the features.
+        InputError: A file is missing or damaged.
+    """
+    model = read_model(model_path)
+    given_box = read_box(options.box) if options.box else None
+    if not model.num_points3D():
+        raise ModelError(f"{model_path}: the model has no 3D points; triangulate it first")
+    source = _find_source(model_path, model, options, progress)
+    _check_keypoints(model, source.features)
+    info = MapInfo(
+        extractor=source.extractor,
+        extractor_options=source.extractor_options,
+        box=given_box or estimate_box(model),
+        box_source="given" if given_box else "estimated",
+        origin=f"imported COLMAP model with descriptors from {source.origin}",
+    )
+    return Map(model=model, features=source.features, matches=source.matches, info=info)
+
+
+def _find_source(
+    model_path: Path, model: pycolmap.Reconstruction, options: ImportOptions, progress: ProgressBar
+) -> _Source:
+    if options.features:
+        return _from_hloc(model, options)
+    if options.images:
+        return _from_images(model, options.images, progress)
+    database = options.database or _database_beside(model_path)
+    return _from_database(model, database)
+
+
+def _database_beside(model_path: Path) -> Path:
+    """COLMAP's habit is PROJECT/database.db and PROJECT/sparse/0."""
+    folders = [model_path, *model_path.absolute().parents[:2]]
+    found = [folder / "database.db" for folder in folders if (folder / "database.db").is_file()]
+    if not found:
+        raise InputError(
+            f"{model_path}: no database.db beside the model; say where its descriptors come from with "
+            "--database FILE, --features FILE (hloc) or --images DIR"
+        )
+    return found[0]
+
+
+def _from_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
+    if not path.is_file():
+        raise InputError(f"{path}: no such database")
+    if path.read_bytes()[:16] != b"SQLite format 3\0":
+        raise InputError(f"{path}: not a COLMAP database")
+    with pycolmap.Database.open(path) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        extractors = set()
+        features = {}
+        for image in _posed_images(model):
+            if image.name not in ids or not database.exists_descriptors(ids[image.name]):
+                raise ModelError(f"{path}: has no descriptors of image {image.name!r} of the model")
+            features[image.name], extractor = _read_database_features(database, ids[image.name], image)
+            extractors.add(extractor)
+    if len(extractors) > 1:
+        raise ModelError(f"{path}: holds features of several extractors ({', '.join(sorted(extractors))})")
+    names = {image_id: name for name, image_id in ids.items() if name in features}
+    return _Source(
+        features=features,
+        matches=verified_matches(path, names),
+        extractor=extractors.pop(),
+        extractor_options={},
+        origin="its database",
+    )
+
+
+def _read_database_features(
+    database: pycolmap.Database, image_id: int, image: pycolmap.Image
+) -> tuple[Features, str]:
+    keypoints = np.asarray(database.read_keypoints(image_id), np.float32)[:, :2]
+    stored = database.read_descriptors(image_id)
+    is_sift = stored.type in (pycolmap.FeatureExtractorType.SIFT, pycolmap.FeatureExtractorType.UNDEFINED)
+    data = np.asarray(stored.data, np.uint8)
+    features = Features(
+        keypoints=np.ascontiguousarray(keypoints),
+        descriptors=data if is_sift else data.view(np.float32),
+        scores=np.ones(len(keypoints), np.float32),
+        image_size=(image.camera.width, image.camera.height),
+    )
+    return features, "sift" if is_sift else stored.type.name.lower().split("_")[0]
+
+
+def _from_hloc(model: pycolmap.Reconstruction, options: ImportOptions) -> _Source:
+    path = options.features
+    if path is None:
+        raise ValueError("features must be given")
+    stored = FeatureFile(path)
+    features = {}
+    for image in _posed_images(model):
+        if image.name not in stored:
+            raise ModelError(f"{path}: has no features of image {image.name!r} of the model")
+        features[image.name] = stored[image.name]
+    matches = {}
+    if options.matches:
+        raw = MatchFile(options.matches, sorted(features))
+        matches = _consistent_matches(model, features, raw)
+    return _Source(
+        features=features,
+        matches=matches,
+        extractor=options.extractor,
+        extractor_options={},
+        origin="hloc's features",
+    )
+
+
+def _consistent_matches(
+    model: pycolmap.Reconstruction, features: Mapping[str, Features], raw: Mapping[tuple[str, str], IndexPairs]
+) -> dict[tuple[str, str], IndexPairs]:
+    """hloc's matches are not verified: keep those that fit the epipolar geometry of the model's poses."""
+    images = {image.name: image for image in _posed_images(model)}
+    verified = {}
+    for a, b in raw:
+        pairs = raw[a, b]
+        rays = [
+            np.asarray(images[name].camera.cam_from_img(features[name].keypoints[column].astype(np.float64)))
+            for name, column in ((a, pairs[:, 0]), (b, pairs[:, 1]))
+        ]
+        b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
+        essential = pycolmap.essential_matrix_from_pose(b_from_a)
+        squared = np.asarray(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
+        focal = min(images[a].camera.mean_focal_length(), images[b].camera.mean_focal_length())
+        good = pairs[squared * focal**2 < _MAX_EPIPOLAR_ERROR_PX**2]
+        if len(good) >= _MIN_INLIERS:
+            verified[a, b] = good
+    return verified
+
+
+def _from_images(model: pycolmap.Reconstruction, images: Path, progress: ProgressBar) -> _Source:
+    if not images.is_dir():
+        raise InputError(f"{images}: no such folder of images")
+    features, extractor = redescribe(_posed_images(model), images, progress)
+    return _Source(
+        features=features,
+        matches={},
+        extractor=extractor.name,
+        extractor_options=extractor.options,
+        origin="its images",
+    )
+
+
+def _posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+
+
+def _check_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Features]) -> None:
+    for image in _posed_images(model):
+        count, described = image.num_points2D(), len(features[image.name])
+        if count != described:
+            raise ModelError(
+                f"image {image.name!r} has {count} keypoints in the model but {described} in the features: "
+                "they are not of the same run"
+            )

@@ -1,0 +1,113 @@
+"""Maps on disk.
+
+MAP/
+  sparse/       COLMAP model, opens in COLMAP, pycolmap and hloc
+  features.h5   local features in hloc's layout
+  matches.h5    verified matches in hloc's layout; may be missing
+  map.json      format version, extractor and its options, box, unit, origin
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from slimsfm.errors import InputError, MapError
+from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
+from slimsfm.files import replacing
+from slimsfm.geometry import Box
+from slimsfm.mapping.map import Map, MapInfo, check_map
+from slimsfm.mapping.model import read_model
+
+FORMAT_VERSION = 1
+"""Version of the layout; a map of a later one is refused."""
+
+
+def read_map(path: Path) -> Map:
+    """Read a map; its features are read from disk when they are needed.
+
+    Raises:
+        MapError: This is no map, a part of it is damaged or missing, or it is of a later format.
+    """
+    info = _read_info(path)
+    try:
+        model = read_model(path / "sparse")
+        features = FeatureFile(path / "features.h5")
+        matches = path / "matches.h5"
+        names = sorted(image.name for image in model.images.values())
+        map_ = Map(
+            model=model,
+            features=features,
+            matches=MatchFile(matches, names) if matches.exists() else {},
+            info=info,
+        )
+        check_map(map_)
+    except InputError as error:
+        raise MapError(f"{path}: not a usable map: {error}") from error
+    return map_
+
+
+def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
+    """Write a map beside its place and rename it there, so that there never is half a map.
+
+    Raises:
+        OutputError: The place is taken and `overwrite` is off, or cannot be written.
+        MapError: The map's parts do not fit each other.
+    """
+    check_map(map)
+    with replacing(path, overwrite=overwrite) as partial:
+        (partial / "sparse").mkdir(parents=True)
+        map.model.write(partial / "sparse")
+        with FeatureWriter(partial / "features.h5") as writer:
+            for name in map.images:
+                writer.write(name, map.features[name])
+        if map.matches:
+            counts = {name: image.num_points2D() for name, image in map.images.items()}
+            write_matches(partial / "matches.h5", map.matches, counts)
+        (partial / "map.json").write_text(json.dumps(_info_to_json(map.info), indent=2) + "\n")
+
+
+def bytes_by_part(path: Path) -> dict[str, int]:
+    """Size in bytes of each part of a map on disk, and their `total`."""
+    sizes = {
+        part.name: sum(file.stat().st_size for file in [part, *part.rglob("*")] if file.is_file())
+        for part in sorted(path.iterdir())
+        if part.name in ("sparse", "features.h5", "matches.h5", "map.json")
+    }
+    return {**sizes, "total": sum(sizes.values())}
+
+
+def _info_to_json(info: MapInfo) -> dict:
+    return {
+        "format_version": FORMAT_VERSION,
+        "extractor": {"name": info.extractor, "options": info.extractor_options},
+        "box": {"corners": info.box.corners.tolist(), "source": info.box_source},
+        "unit": info.unit,
+        "origin": info.origin,
+    }
+
+
+def _read_info(path: Path) -> MapInfo:
+    file = path / "map.json"
+    try:
+        data = json.loads(file.read_text())
+        version = data["format_version"]
+        if version > FORMAT_VERSION:
+            raise MapError(
+                f"{path}: a map of format {version}, but this slimsfm reads formats up to {FORMAT_VERSION}; "
+                "upgrade slimsfm"
+            )
+        return MapInfo(
+            extractor=data["extractor"]["name"],
+            extractor_options=data["extractor"]["options"],
+            box=Box.from_corners(np.array(data["box"]["corners"], np.float64)),
+            box_source=data["box"]["source"],
+            unit=data["unit"],
+            origin=data["origin"],
+        )
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise MapError(
+            f"{path}: not a map (it has no map.json); make one with `slimsfm build` or `import`"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise MapError(f"{file}: damaged ({error}); build or import the map again") from error

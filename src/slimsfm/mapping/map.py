@@ -1,0 +1,129 @@
+"""The map: an SfM model, its local features and the object's box."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import pycolmap
+from jaxtyping import UInt8
+
+from slimsfm.arrays import Ids, IndexPairs, Points3D
+from slimsfm.errors import MapError
+from slimsfm.features import Features
+from slimsfm.geometry import Box
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapInfo:
+    """What a map says of itself, in its `map.json`."""
+
+    extractor: str
+    """Name of the extractor whose features the map holds; queries are extracted with the same."""
+
+    extractor_options: dict = field(default_factory=dict)
+    """Options of the extractor."""
+
+    box: Box
+    """The object's box in the map's frame."""
+
+    box_source: str
+    """Where the box comes from: "given" or "estimated"."""
+
+    unit: str = "unknown"
+    """The unit of the map's frame: "metre", or "unknown" where SfM left the scale open."""
+
+    origin: str
+    """A sentence on where the map came from."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observations:
+    """Which keypoints of an image see which points of the map."""
+
+    rows: Ids
+    """Rows of the image's features, ascending."""
+
+    points: Ids
+    """For each of them the row of the point in `Map.points3D_in_world`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Map:
+    """Everything that a query is localized against. Nothing in it changes."""
+
+    model: pycolmap.Reconstruction
+    """The SfM model; keypoint i of an image is row i of its features."""
+
+    features: Mapping[str, Features]
+    """Local features by image name; may be read from disk on access."""
+
+    matches: Mapping[tuple[str, str], IndexPairs] = field(default_factory=dict)
+    """Verified matches by pair of image names; empty where the map has none."""
+
+    info: MapInfo
+    """Extractor, box, unit and origin."""
+
+    @property
+    def box(self) -> Box:
+        """The object's box in the map's frame."""
+        return self.info.box
+
+    @cached_property
+    def images(self) -> dict[str, pycolmap.Image]:
+        """The reference images, those with a pose, by name in sorted order."""
+        found = [self.model.image(image_id) for image_id in self.model.reg_image_ids()]
+        return {image.name: image for image in sorted(found, key=lambda image: image.name)}
+
+    @cached_property
+    def point3D_ids(self) -> Ids:
+        """Ids of the points, ascending: the order of every array of points."""
+        return np.array(sorted(self.model.point3D_ids()), dtype=np.int64)
+
+    @cached_property
+    def points3D_in_world(self) -> Points3D:
+        """Positions of the points."""
+        points = self.model.points3D
+        return np.array([points[i].xyz for i in self.point3D_ids], np.float64).reshape(-1, 3)
+
+    @cached_property
+    def colors(self) -> UInt8[np.ndarray, "n 3"]:
+        """RGB of the points."""
+        points = self.model.points3D
+        return np.array([points[i].color for i in self.point3D_ids], np.uint8).reshape(-1, 3)
+
+    @cached_property
+    def observations(self) -> dict[str, Observations]:
+        """The observations of each reference image, by name in sorted order."""
+        return {name: self._observations(image) for name, image in self.images.items()}
+
+    def _observations(self, image: pycolmap.Image) -> Observations:
+        rows = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
+        points2D = image.points2D
+        ids = np.array([points2D[row].point3D_id for row in rows], dtype=np.int64)
+        return Observations(rows=rows, points=np.searchsorted(self.point3D_ids, ids))
+
+    @property
+    def shared_camera(self) -> pycolmap.Camera | None:
+        """The camera of all reference images, or None where they have several."""
+        ids = {image.camera_id for image in self.images.values()}
+        return self.model.camera(ids.pop()) if len(ids) == 1 else None
+
+
+def check_map(map: Map) -> None:
+    """Make sure that a map's parts fit each other.
+
+    Raises:
+        MapError: There is no reference image or point, or an image's features are missing or of another
+            number than its keypoints.
+    """
+    if not map.images or not len(map.point3D_ids):
+        raise MapError(
+            f"the map has {len(map.images)} images and {len(map.point3D_ids)} points; it needs both"
+        )
+    for name, image in map.images.items():
+        if name not in map.features:
+            raise MapError(f"the map has no features of its image {name!r}")
+        rows = map.observations[name].rows
+        if len(rows) and rows[-1] >= image.num_points2D():
+            raise MapError(f"an observation in image {name!r} points at a keypoint that is not there")

@@ -1,0 +1,90 @@
+"""Which pairs of images to match."""
+
+import re
+from collections.abc import Iterable, Mapping
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.cluster.vq import kmeans2
+
+from slimsfm.arrays import Descriptors
+from slimsfm.features import Features, unit_rows
+
+Pairs = list[tuple[str, str]]
+"""Pairs of image names, each in sorted order, without repetition, sorted."""
+
+PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
+
+_MOST_EXHAUSTIVE = 200  # images, up to which "auto" matches each with every other one
+_WORDS = 64  # of the visual vocabulary
+_WORD_SAMPLES = 50_000  # descriptors that it is trained on
+
+
+def choose_pairs(features: Mapping[str, Features], choice: PairChoice, *, seed: int) -> Pairs:
+    """Choose the pairs of images to match; `BuildOptions.pairs` says what each choice means."""
+    names = sorted(features)
+    if choice == "exhaustive" or (choice == "auto" and len(names) <= _MOST_EXHAUSTIVE):
+        return exhaustive_pairs(names)
+    if choice == "sequential":
+        return sequential_pairs(names)
+    similar = similar_pairs(names, _global_descriptors(features, seed))
+    return similar if choice == "similar" else sorted({*sequential_pairs(names), *similar})
+
+
+def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[np.ndarray, "n kd"]:
+    """Describe each image by a vocabulary trained on these very images."""
+    names = sorted(features)
+    share = max(1, _WORD_SAMPLES // len(names))
+    generator = np.random.default_rng(seed)
+    samples = [unit_rows(generator.permutation(features[name].descriptors, axis=0)[:share]) for name in names]
+    words = kmeans2(np.concatenate(samples), _WORDS, minit="++", seed=seed)[0].astype(np.float32)
+    return np.stack([vlad(unit_rows(features[name].descriptors), words) for name in names])
+
+
+def exhaustive_pairs(names: Iterable[str]) -> Pairs:
+    """Every image with every other one."""
+    return list(combinations(sorted(names), 2))
+
+
+def sequential_pairs(names: Iterable[str], *, overlap: int = 10) -> Pairs:
+    """Each image with the next `overlap` ones and with those 2, 4, 8 ... beyond, as frames of one video.
+
+    The order is that of the numbers in the names: frame2 comes before frame10.
+    """
+    ordered = sorted(names, key=_natural)
+    steps = [*range(1, overlap + 1), *(overlap + 2**i for i in range(1, overlap.bit_length() + 1))]
+    found = (tuple(sorted((ordered[i], ordered[i + k]))) for k in steps for i in range(len(ordered) - k))
+    return sorted({(a, b) for a, b in found})
+
+
+def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, k: int = 20) -> Pairs:
+    """Each image with the k that look most alike, by the dot product of their global descriptors."""
+    similarities = descriptors @ descriptors.T
+    np.fill_diagonal(similarities, -np.inf)
+    nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(k, len(names) - 1)]
+    found = (tuple(sorted((names[i], names[j]))) for i in range(len(names)) for j in nearest[i])
+    return sorted({(a, b) for a, b in found})
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def vlad(descriptors: Descriptors, words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:
+    """Describe an image by the residuals of its local descriptors to their nearest visual words [1].
+
+    Each word's sum is normalized, then the whole, against bursts of repeated texture [2].
+
+    References:
+        [1] Jegou, Douze, Schmid and Perez, Aggregating Local Descriptors into a Compact Image Representation,
+            CVPR 2010.
+        [2] Arandjelovic and Zisserman, All about VLAD, CVPR 2013.
+    """
+    nearest = (descriptors @ words.T - 0.5 * (words**2).sum(axis=1)).argmax(axis=1)
+    sums = np.zeros_like(words)
+    np.add.at(sums, nearest, descriptors - words[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+    return (sums / max(float(np.linalg.norm(sums)), 1e-12)).ravel()

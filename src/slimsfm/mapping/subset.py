@@ -1,0 +1,109 @@
+"""A map of some of the images: what the paper calls X' and P'."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+import pycolmap
+
+from slimsfm.arrays import IndexPairs
+from slimsfm.errors import InputError
+from slimsfm.features import Features
+from slimsfm.mapping.map import Map
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+
+def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) -> Map:
+    """Keep some reference images and the points they see.
+
+    A point stays if at least `min_track_length` of the kept images observe it; 1 gives the paper's P'. Ids,
+    names, cameras, poses and positions stay as they are; tracks lose the observations of dropped images.
+
+    Raises:
+        InputError: A name is not that of a reference image, or no name is given.
+    """
+    kept = sorted(set(names))
+    if not kept:
+        raise InputError("no image was chosen to be kept")
+    for name in kept:
+        if name not in map.images:
+            raise InputError(
+                f"image {name!r} is not in the map; `slimsfm info MAP --images` lists those that are"
+            )
+    chosen = frozenset(kept)
+    features: Mapping[str, Features] = Selection(map.features, chosen.__contains__)
+    matches: Mapping[tuple[str, str], IndexPairs] = Selection(map.matches, chosen.issuperset)
+    model = _subset_model(map, kept, min_track_length)
+    return replace(map, model=model, features=features, matches=matches)
+
+
+class Selection(Mapping[Key, Value]):
+    """The entries of a mapping whose keys are wanted, read from it on access."""
+
+    def __init__(self, source: Mapping[Key, Value], wanted: Callable[[Key], bool]) -> None:
+        self._source = source
+        self._keys = {key: None for key in source if wanted(key)}
+
+    def __getitem__(self, key: Key) -> Value:
+        if key not in self._keys:
+            raise KeyError(key)
+        return self._source[key]
+
+    def __iter__(self) -> Iterator[Key]:
+        return iter(self._keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+
+def _subset_model(map: Map, names: list[str], min_track_length: int) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    kept = {map.images[name].image_id: map.images[name] for name in names}
+    _copy_cameras_and_rigs(map.model, model, kept)
+    for image_id in sorted(kept):
+        image = kept[image_id]
+        copy = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image_id)
+        copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
+        copy.frame_id = image.frame_id
+        model.add_image(copy)
+    _copy_points(map, model, kept, min_track_length)
+    return model
+
+
+def _copy_cameras_and_rigs(
+    source: pycolmap.Reconstruction, target: pycolmap.Reconstruction, kept: dict[int, pycolmap.Image]
+) -> None:
+    """Copy what the kept images need; a rig stays whole, with all of its cameras."""
+    frames = {image.frame_id: source.frame(image.frame_id) for image in kept.values()}
+    rigs = {frame.rig_id: source.rig(frame.rig_id) for frame in frames.values()}
+    sensors = {sensor.id for rig in rigs.values() for sensor in rig.sensor_ids()}
+    for camera_id in sorted(sensors & set(source.cameras)):
+        target.add_camera(source.camera(camera_id))
+    for rig_id in sorted(rigs):
+        target.add_rig(rigs[rig_id])
+    for frame_id in sorted(frames):
+        target.add_frame(_frame_of(frames[frame_id], kept))
+
+
+def _frame_of(frame: pycolmap.Frame, kept: dict[int, pycolmap.Image]) -> pycolmap.Frame:
+    """The frame with only those of its images that are kept."""
+    copy = pycolmap.Frame(frame_id=frame.frame_id, rig_id=frame.rig_id)
+    for data in frame.data_ids:
+        if data.id in kept:
+            copy.add_data_id(data)
+    copy.rig_from_world = frame.rig_from_world
+    return copy
+
+
+def _copy_points(map: Map, model: pycolmap.Reconstruction, kept: dict, min_track_length: int) -> None:
+    points = map.model.points3D
+    for point3D_id in map.point3D_ids.tolist():
+        point = points[point3D_id]
+        elements = [element for element in point.track.elements if element.image_id in kept]
+        if len(elements) < min_track_length:
+            continue
+        copy = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error)
+        copy.track = pycolmap.Track(elements)
+        model.add_point3D_with_id(point3D_id, copy)

@@ -1,0 +1,75 @@
+"""Image files: which there are, their upright pixels, and the camera that their EXIF data tells of."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from PIL import ExifTags, ImageOps, UnidentifiedImageError
+from PIL import Image as PillowImage
+
+from slimsfm.arrays import GrayImage, Image
+from slimsfm.errors import ImageError, InputError
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+
+
+def list_images(folder: Path) -> list[str]:
+    """Names of the images below a folder, relative to it, with forward slashes, sorted.
+
+    Raises:
+        InputError: The folder does not exist or holds no image.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of images")
+    paths = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    names = sorted(path.relative_to(folder).as_posix() for path in paths)
+    names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
+    if not names:
+        raise InputError(f"{folder}: holds no image ({', '.join(sorted(SUFFIXES))})")
+    return names
+
+
+def read_image(path: Path) -> Image:
+    """Read an image as RGB, turned upright as its EXIF orientation says.
+
+    Raises:
+        ImageError: The file is missing or is no complete image.
+    """
+    try:
+        with PillowImage.open(path) as file:
+            return np.array(ImageOps.exif_transpose(file).convert("RGB"))
+    except FileNotFoundError as error:
+        raise ImageError(f"{path}: no such image") from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise ImageError(f"{path}: not a readable image; remove or replace it") from error
+
+
+def read_mask(path: Path) -> GrayImage:
+    """Read a mask: features are kept where it is not black.
+
+    Raises:
+        ImageError: The file is missing or is no complete image.
+    """
+    return read_image(path).max(axis=2)
+
+
+def camera_from_exif(path: Path) -> pycolmap.Camera:
+    """Guess the camera of an image: its focal length from EXIF, else 1.2 times the longer side.
+
+    Returns:
+        A SIMPLE_RADIAL camera of the upright image without distortion; `has_prior_focal_length` tells
+        whether EXIF gave the focal length.
+
+    Raises:
+        ImageError: The file is no image.
+    """
+    try:
+        camera = pycolmap.infer_camera_from_image(path)
+        with PillowImage.open(path) as file:
+            turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
+            upright_size = file.size[::-1] if turned else file.size
+    except (UnidentifiedImageError, OSError, ValueError, RuntimeError) as error:
+        raise ImageError(f"{path}: not a readable image; remove or replace it") from error
+    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
+    guess.has_prior_focal_length = camera.has_prior_focal_length
+    return guess

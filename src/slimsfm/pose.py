@@ -1,0 +1,138 @@
+"""The pose of a calibrated camera from 2D-3D matches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+import pycolmap
+
+from slimsfm.arrays import Mask, Points2D, Points3D
+
+_MINIMAL = 3  # matches that P3P needs
+
+
+@dataclass(frozen=True, kw_only=True)
+class RansacOptions:
+    """How the robust pose search samples and scores its hypotheses."""
+
+    max_error_px: float = 6.0
+    """Largest reprojection error of an inlier."""
+
+    min_inliers: int = 12
+    """A pose with fewer inliers is no pose."""
+
+    max_iterations: int = 10_000
+    """Most hypotheses to try."""
+
+    seed: int = 0
+    """Seed of the sampler: equal inputs and seed give equal poses."""
+
+    def __post_init__(self) -> None:
+        if not self.max_error_px > 0:
+            raise ValueError(f"max_error_px must be positive, got {self.max_error_px}")
+        if self.min_inliers < _MINIMAL + 1:
+            raise ValueError(f"min_inliers must be at least {_MINIMAL + 1}, got {self.min_inliers}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations must be at least 1, got {self.max_iterations}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseEstimate:
+    """Where a camera stood, and the matches that say so."""
+
+    cam_from_world: pycolmap.Rigid3d
+    """The pose."""
+
+    inliers: Mask
+    """Which of the given matches agree with the pose."""
+
+    @property
+    def num_inliers(self) -> int:
+        """How many matches agree with the pose."""
+        return int(self.inliers.sum())
+
+
+def estimate_pose(
+    points2D: Points2D,
+    points3D_in_world: Points3D,
+    camera: pycolmap.Camera,
+    options: RansacOptions = RansacOptions(),
+) -> PoseEstimate | None:
+    """Estimate where a calibrated camera stood from 2D-3D matches.
+
+    P3P inside LO-RANSAC [1], then a robust refinement over the inliers. The lens distortion of any COLMAP
+    camera model is taken out beforehand, so that one solver serves all of them.
+
+    Args:
+        points2D: Pixels; row i matches row i of `points3D_in_world`.
+        points3D_in_world: Points in the frame and unit of the map.
+        camera: Intrinsics of the image; they are not refined.
+        options: How to search.
+
+    Returns:
+        The pose, or None when no hypothesis has enough inliers.
+
+    Raises:
+        ValueError: The rows do not correspond, or a coordinate is not finite.
+
+    References:
+        [1] Chum, Matas and Kittler, Locally Optimized RANSAC, DAGM 2003.
+    """
+    _check_matches(points2D, points3D_in_world)
+    if len(points2D) < options.min_inliers:
+        return None
+    pinhole_points2D = _undistort(points2D, camera)
+    usable = np.flatnonzero(np.isfinite(pinhole_points2D).all(axis=1))
+    if len(usable) < options.min_inliers:
+        return None
+    pose, info = poselib.estimate_absolute_pose(
+        pinhole_points2D[usable],
+        points3D_in_world[usable],
+        _ideal_pinhole(camera),
+        *_poselib_options(options),
+    )
+    inliers = np.zeros(len(points2D), dtype=bool)
+    inliers[usable] = info["inliers"]
+    if inliers.sum() < options.min_inliers:
+        return None
+    w, x, y, z = pose.q
+    rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+    return PoseEstimate(cam_from_world=pycolmap.Rigid3d(rotation, pose.t), inliers=inliers)
+
+
+def _check_matches(points2D: Points2D, points3D_in_world: Points3D) -> None:
+    if len(points2D) != len(points3D_in_world):
+        raise ValueError(
+            f"points2D and points3D_in_world must match row by row, got {len(points2D)} and "
+            f"{len(points3D_in_world)} rows"
+        )
+    for name, points in (("points2D", points2D), ("points3D_in_world", points3D_in_world)):
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        if len(bad):
+            raise ValueError(f"{name} must be finite, got {points[bad[0]].tolist()} in row {bad[0]}")
+
+
+def _undistort(points2D: Points2D, camera: pycolmap.Camera) -> Points2D:
+    """Pixels of a pinhole camera of equal focal length, principal point (0, 0); NaN behind the camera."""
+    rays = np.asarray(camera.cam_from_img(points2D), dtype=np.float64).reshape(-1, 2)
+    return camera.mean_focal_length() * rays
+
+
+def _ideal_pinhole(camera: pycolmap.Camera) -> dict:
+    focal = camera.mean_focal_length()
+    return {
+        "model": "SIMPLE_PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [focal, 0.0, 0.0],
+    }
+
+
+def _poselib_options(options: RansacOptions) -> tuple[dict, dict]:
+    ransac = {
+        "max_reproj_error": options.max_error_px,
+        "max_iterations": options.max_iterations,
+        "min_iterations": min(1000, options.max_iterations),
+        "seed": options.seed,
+    }
+    return ransac, {"loss_type": "CAUCHY"}
