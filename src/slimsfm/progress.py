@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -21,6 +21,7 @@ from rich.text import Text
 Item = TypeVar("Item")
 
 
+@runtime_checkable
 class ProgressBar(Protocol):
     """Yields the items unchanged and may tell somebody about it."""
 

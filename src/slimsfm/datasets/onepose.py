@@ -32,6 +32,7 @@ from PIL import Image as PilImage
 
 from slimsfm.errors import ImageError, InputError
 from slimsfm.geometry import Box
+from slimsfm.mapping.box import read_box
 
 _CORNER_ORDER = [0, 4, 5, 1, 2, 6, 7, 3]
 """Which corner of a `Box` is the k-th of the file."""
@@ -101,18 +102,6 @@ def read_object(directory: Path, *, frame_step: int = 1) -> ObjectSequences:
         )
     mapping, query = (read_sequence(sequences[k], frame_step=frame_step) for k in (0, -1))
     return ObjectSequences(name=directory.name, mapping=mapping, query=query, box=box)
-
-
-def read_box(path: Path) -> Box:
-    """Read the corners of an object's box.
-
-    Raises:
-        InputError: The file is missing or does not hold the corners of a box.
-    """
-    try:
-        return Box.from_corners(_read_matrix(path, (8, 3)))
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def read_sequence(directory: Path, *, frame_step: int = 1) -> PosedSequence:

@@ -1,7 +1,7 @@
 """What every extractor takes and gives."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped, UInt8
@@ -38,6 +38,7 @@ class Features:
         )
 
 
+@runtime_checkable
 class Extractor(Protocol):
     """Finds and describes keypoints. Equal images give equal features."""
 

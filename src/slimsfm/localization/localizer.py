@@ -9,6 +9,7 @@ import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.features import Features, load_extractor, unit_rows
+from slimsfm.localization.cameras import scaled_camera
 from slimsfm.localization.strategy import Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -94,7 +95,8 @@ class Localizer:
         camera = camera or self._map_camera(image)
         if (camera.width, camera.height) != image.shape[1::-1]:
             raise ValueError(
-                f"camera is of {camera.width}x{camera.height} pixels, the image of {image.shape[1]}x{image.shape[0]}"
+                f"camera must be of the image's size {image.shape[1]}x{image.shape[0]}, "
+                f"got {camera.width}x{camera.height}"
             )
         start = perf_counter()
         features = self._extractor.extract(image)
@@ -118,15 +120,11 @@ class Localizer:
         return Localization(pose=pose, num_matches=len(matches), seconds=seconds)
 
     def _map_camera(self, image: Image) -> pycolmap.Camera:
-        shared = self._map.shared_camera
-        if shared is None:
-            raise ValueError("camera must be given: the map's reference images have several")
         height, width = image.shape[:2]
-        if abs(width * shared.height - height * shared.width) > max(shared.width, shared.height):
+        shared = self._map.shared_camera
+        camera = shared and scaled_camera(shared, width, height)
+        if camera is None:
             raise ValueError(
-                f"camera must be given: the image is {width}x{height} pixels, those of the map "
-                f"{shared.width}x{shared.height}"
+                f"camera must be given: the map has no one camera that could have taken an image of {width}x{height}"
             )
-        scaled = pycolmap.Camera(shared.todict())
-        scaled.rescale(width, height)
-        return scaled
+        return camera

@@ -1,7 +1,7 @@
 """What every way of matching a query against a map takes and gives."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class PointMatches:
         return len(self.keypoints)
 
 
+@runtime_checkable
 class Strategy(Protocol):
     """Matches queries against one map. Made once for a map, then called for every query."""
 

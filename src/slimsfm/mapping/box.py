@@ -11,8 +11,8 @@ from slimsfm.arrays import Ids, Points3D
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
 
-_ROUNDS = 20  # of trimming; it settles in fewer
-_REACH = 2.5  # points beyond this many standard deviations are background
+_ROUNDS = 50  # of trimming; it settles in fewer
+_REACH = 2.0  # points beyond this many times the root mean square distance are background
 _SPREAD = 0.25  # of the Gaussian, over the shorter side of the image
 _TAIL = 0.01  # share of the weight left out at either end of the box
 
@@ -41,9 +41,9 @@ def read_box(path: Path) -> Box:
 def estimate_box(model: pycolmap.Reconstruction) -> Box:
     """Estimate the box of what the images look at.
 
-    A point counts by how often, and how near the middle of an image, it is seen; what lies far out, by the
-    counts' own mean and covariance, is background and trimmed until nothing changes. The box is aligned with
-    the principal axes of what remains and holds all but 1 % of the count at each of its six sides.
+    A point counts by how often, and how near the middle of an image, it is seen. What is farther from the mean
+    than twice the root mean square distance is background and trimmed, until nothing changes. The box is
+    aligned with the principal axes of what remains and holds all but 1 % of the count at each of its six sides.
 
     Where masks were used, features and so points lie on the object alone, and the same rule holds.
     """
@@ -52,10 +52,9 @@ def estimate_box(model: pycolmap.Reconstruction) -> Box:
     weights = _centrality(model, np.array(ids, np.int64))
     inside = np.ones(len(points), dtype=bool)
     for _ in range(_ROUNDS):
-        mean, covariance = _moments(points[inside], weights[inside])
-        offsets = points - mean
-        squared = np.einsum("ni,ij,nj->n", offsets, np.linalg.inv(covariance), offsets)
-        kept = squared < _REACH**2
+        mean = np.average(points[inside], axis=0, weights=weights[inside])
+        squared = ((points - mean) ** 2).sum(axis=1)
+        kept = squared <= _REACH**2 * np.average(squared[inside], weights=weights[inside])
         if np.array_equal(kept, inside):
             break
         inside = kept
@@ -76,19 +75,14 @@ def _centrality(model: pycolmap.Reconstruction, ids: Ids) -> Float64[np.ndarray,
     return weights + 1e-12
 
 
-def _moments(points: Points3D, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _box_around(points: Points3D, weights: Float64[np.ndarray, " n"]) -> Box:
     mean = np.average(points, axis=0, weights=weights)
-    covariance = np.cov(points.T, aweights=weights)
-    return mean, covariance + 1e-12 * (np.trace(covariance) + 1e-30) * np.eye(3)
-
-
-def _box_around(points: Points3D, weights: np.ndarray) -> Box:
-    mean, covariance = _moments(points, weights)
+    covariance = ((points - mean).T * weights) @ (points - mean)
     axes = np.linalg.eigh(covariance)[1].T
     axes *= np.where(axes[np.arange(3), np.abs(axes).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
     coordinates = (points - mean) @ axes.T
     low, high = np.array([_weighted_range(coordinates[:, i], weights) for i in range(3)]).T
-    half = np.maximum((high - low) / 2, 1e-3 * (high - low).max())
+    half = np.maximum((high - low) / 2, max(1e-3 * (high - low).max(), 1e-9))
     return Box(mean + (low + high) / 2 @ axes, half[:, None] * axes)
 
 

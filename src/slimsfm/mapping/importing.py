@@ -179,7 +179,9 @@ def _from_hloc(model: pycolmap.Reconstruction, options: ImportOptions) -> _Sourc
 
 
 def _consistent_matches(
-    model: pycolmap.Reconstruction, features: Mapping[str, Features], raw: Mapping[tuple[str, str], IndexPairs]
+    model: pycolmap.Reconstruction,
+    features: Mapping[str, Features],
+    raw: Mapping[tuple[str, str], IndexPairs],
 ) -> dict[tuple[str, str], IndexPairs]:
     """hloc's matches are not verified: keep those that fit the epipolar geometry of the model's poses."""
     images = {image.name: image for image in _posed_images(model)}

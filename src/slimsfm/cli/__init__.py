@@ -1,0 +1,71 @@
+"""The command line: one file a command, each of which parses, calls the library and prints."""
+
+import signal
+import sys
+from importlib import import_module
+from types import FrameType
+
+COMMANDS = {
+    "build": "photos -> map",
+    "import": "COLMAP model, hloc output -> map",
+    "info": "what is in a map",
+    "reduce": "map -> slim map",
+    "localize": "poses of new images",
+    "benchmark": "speed and accuracy, full against slim",
+    "synthesize": "textured objects with exact ground truth",
+    "demo": "all of it, on objects it makes itself",
+}
+"""Each is the module `slimsfm.cli.NAME_command`; naming one imports none of the others."""
+
+_INTRODUCTION = """slimsfm makes a Structure-from-Motion model small and localizing in it fast,
+and says what that costs.
+
+  slimsfm demo                          see it work, in under 3 minutes
+  slimsfm build PHOTOS -o MAP           or: slimsfm import COLMAP_MODEL -o MAP
+  slimsfm reduce MAP -o SMALL           keep what is enough to localize
+  slimsfm localize SMALL IMAGES -o poses.json
+  slimsfm benchmark images PHOTOS -o RESULTS
+
+Commands: {commands}. Each explains itself with --help."""
+
+
+def main() -> None:
+    """Run the command that the first argument names. Exit code 2 and one line say what a user can mend."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command and return its exit code."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_INTRODUCTION.format(commands=", ".join(COMMANDS)))
+        return 0
+    name, *rest = arguments
+    if name == "--version":
+        from importlib.metadata import version
+
+        print(f"slimsfm {version('slimsfm')}")
+        return 0
+    if name not in COMMANDS:
+        return _fail(f"{name!r} is no command; there are {', '.join(COMMANDS)}")
+    from slimsfm.cli.output import quiet
+    from slimsfm.errors import SlimsfmError
+
+    try:
+        with quiet():
+            import_module(f"slimsfm.cli.{name}_command").main(rest)
+    except SlimsfmError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        print("slimsfm: interrupted; nothing half-made was left behind", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _fail(message: str) -> int:
+    print(f"slimsfm: {message}", file=sys.stderr)
+    return 2
+
+
+def _interrupt(_signum: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -1,0 +1,48 @@
+"""`slimsfm build`."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from slimsfm.cli.output import Flat, ImagesPath, OutputPath, Stopwatch, console, counts, finish, parse
+from slimsfm.files import check_writable
+from slimsfm.mapping.build import BuildOptions, build_map
+from slimsfm.mapping.io import write_map
+from slimsfm.progress import shown
+
+
+def build_photos(
+    images: ImagesPath,
+    /,
+    output: OutputPath,
+    build: Annotated[BuildOptions, Flat] = BuildOptions(),
+    overwrite: bool = False,
+) -> None:
+    """Build a map from a folder of photos.
+
+    Args:
+        images: Folder of photos, with those in its subfolders.
+        output: Where the map is written.
+        build: How to build.
+        overwrite: Replace what is there.
+    """
+    watch = Stopwatch()
+    check_writable(output, overwrite=overwrite)
+    with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
+        made = build_map(images, Path(workspace), build, progress=shown)
+        write_map(made.map, output, overwrite=overwrite)
+    if made.left_out:
+        console.print(f"left out, for they fit the model nowhere: {', '.join(made.left_out)}", style="yellow")
+    box = made.map.box
+    console.print(f"box {made.map.info.box_source}, diagonal {box.diagonal:.3g} ({made.map.info.unit} unit)")
+    parts = counts(made.map)
+    what = (
+        f"{output}: {parts['images']} images, {parts['points']} points, {parts['observations']} observations"
+    )
+    finish(what, watch, "reduce", output, "-o", f"{output}-small")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the command."""
+    parse(build_photos, arguments)

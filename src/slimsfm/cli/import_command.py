@@ -1,0 +1,42 @@
+"""`slimsfm import`."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from slimsfm.cli.output import Flat, ModelPath, OutputPath, Stopwatch, console, counts, finish, parse
+from slimsfm.files import check_writable
+from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.io import write_map
+from slimsfm.progress import shown
+
+
+def import_(
+    model: ModelPath,
+    /,
+    output: OutputPath,
+    source: Annotated[ImportOptions, Flat] = ImportOptions(),
+    overwrite: bool = False,
+) -> None:
+    """Make a map of an existing COLMAP model and the descriptors of its keypoints.
+
+    Args:
+        model: Folder with cameras, images and points3D, as .bin or .txt.
+        output: Where the map is written.
+        source: Where the descriptors come from.
+        overwrite: Replace what is there.
+    """
+    watch = Stopwatch()
+    check_writable(output, overwrite=overwrite)
+    made = import_model(model, source, progress=shown)
+    write_map(made, output, overwrite=overwrite)
+    console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")
+    parts = counts(made)
+    what = (
+        f"{output}: {parts['images']} images, {parts['points']} points, {parts['observations']} observations"
+    )
+    finish(what, watch, "reduce", output, "-o", f"{output}-small")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the command."""
+    parse(import_, arguments)

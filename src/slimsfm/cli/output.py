@@ -1,0 +1,125 @@
+"""What the commands share in parsing and printing."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any, TypeVar
+
+import pycolmap
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from slimsfm.evaluation.metrics import DEG_CM
+from slimsfm.evaluation.table import Row
+from slimsfm.mapping.map import Map
+
+Result = TypeVar("Result")
+
+Flat = tyro.conf.OmitArgPrefixes
+"""Annotates options whose fields are options of the command itself."""
+
+OutputPath = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+"""Where the result goes."""
+
+MapPath = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
+ImagesPath = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
+ModelPath = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL")]
+
+console = Console(highlight=False, soft_wrap=True)
+
+
+def parse(command: Callable[..., Result], arguments: Sequence[str]) -> Result:
+    """Call a command with what the arguments say; its signature is the command line."""
+    name = command.__module__.rpartition(".")[2].removesuffix("_command")
+    return tyro.cli(
+        command,
+        prog=f"slimsfm {name}",
+        args=list(arguments),
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep pycolmap's log, but for fatal messages, off the terminal."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+class Stopwatch:
+    """Seconds since it was made."""
+
+    def __init__(self) -> None:
+        self._start = perf_counter()
+
+    def __str__(self) -> str:
+        return f"{perf_counter() - self._start:.1f} s"
+
+
+def counts(map: Map) -> dict[str, int]:
+    """Images, points and observations of a map."""
+    return {
+        "images": len(map.images),
+        "points": len(map.point3D_ids),
+        "observations": sum(len(seen.rows) for seen in map.observations.values()),
+    }
+
+
+def size(num_bytes: float) -> str:
+    """Bytes for a human reader."""
+    for unit in ("B", "kB", "MB"):
+        if num_bytes < 1000:
+            return f"{num_bytes:.3g} {unit}" if num_bytes < 100 else f"{num_bytes:.0f} {unit}"
+        num_bytes /= 1000
+    return f"{num_bytes:.3g} GB"
+
+
+def print_rows(rows: Sequence[Row]) -> None:
+    """Print the paper's table; the degree-centimetre columns only where the unit is metric."""
+    metric = all(row.scores.deg_cm is not None for row in rows)
+    several = len({row.object for row in rows}) > 1
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for column in _header(metric=metric, several=several):
+        table.add_column(
+            column, justify="right" if column not in ("object", "strategy", "variant") else "left"
+        )
+    for row in rows:
+        table.add_row(*_cells(row, metric=metric, several=several))
+    console.print(table)
+    if not metric:
+        console.print("n°-n cm: not given, for the unit of the map is unknown", style="dim")
+
+
+def _header(*, metric: bool, several: bool) -> list[str]:
+    return [
+        *(["object"] if several else []),
+        *("strategy", "variant", "images", "points", "size"),
+        *([f"{n}°-{n}cm" for n in DEG_CM] if metric else []),
+        *("0.1d", "0.05d", "0.02d", "median error", "localized", "extract", "match", "pose", "FPS"),
+    ]
+
+
+def _cells(row: Row, *, metric: bool, several: bool) -> list[str]:
+    scores, seconds = row.scores, row.scores.seconds
+    return [
+        *([row.object] if several else []),
+        *(row.strategy, row.variant, f"{row.references:.0f}", f"{row.points:.0f}", size(row.map_bytes)),
+        *([f"{share:.1f}" for share in (scores.deg_cm or {}).values()] if metric else []),
+        *(f"{share:.1f}" for share in scores.add.values()),
+        *(f"{scores.median_corner_error:.4f} d", f"{scores.localized:.1f}"),
+        *(f"{1e3 * part:.0f} ms" for part in (seconds.extract, seconds.match, seconds.pose)),
+        f"{scores.fps:.1f}",
+    ]
+
+
+def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:
+    """Say what was made, what it took, and what to do next."""
+    console.print(f"{what} in {watch}")
+    if next_command:
+        console.print("next: slimsfm " + " ".join(str(word) for word in next_command), style="bold")

@@ -1,0 +1,110 @@
+"""Localize queries of known pose against a map and variants of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import pycolmap
+
+from slimsfm.evaluation.metrics import PoseError, pose_error, score
+from slimsfm.evaluation.table import Row
+from slimsfm.features import Features, load_extractor
+from slimsfm.localization import Localization, LocalizationOptions, Localizer
+from slimsfm.mapping.map import Map
+from slimsfm.photos import read_image
+from slimsfm.progress import ProgressBar, silent
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Query:
+    """An image whose true pose is known."""
+
+    path: Path
+    """The image file."""
+
+    camera: pycolmap.Camera
+    """Its intrinsics."""
+
+    cam_from_world: pycolmap.Rigid3d
+    """Its true pose in the map's frame."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedQuery:
+    """A query whose features are there already, for all variants and strategies use the same."""
+
+    query: Query
+    """The query."""
+
+    features: Features
+    """What the map's extractor finds in it."""
+
+    extract_seconds: float
+    """Time that took."""
+
+
+def prepare(map: Map, queries: Sequence[Query], progress: ProgressBar = silent) -> list[PreparedQuery]:
+    """Extract the features of queries with the map's extractor."""
+    extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+    prepared = []
+    for query in progress(queries, "extract query features"):
+        image = read_image(query.path)
+        start = perf_counter()
+        features = extractor.extract(image)
+        seconds = perf_counter() - start
+        prepared.append(PreparedQuery(query=query, features=features, extract_seconds=seconds))
+    return prepared
+
+
+def localize_all(
+    map: Map, queries: Sequence[PreparedQuery], strategy: str, progress: ProgressBar = silent
+) -> list[Localization]:
+    """Localize queries one after the other, after one that is not timed and finds every cache cold."""
+    localizer = Localizer(map, LocalizationOptions(strategy=strategy))
+    localizer.localize_features(queries[0].features, queries[0].query.camera)
+    return [_localize(localizer, query) for query in progress(queries, f"localize queries ({strategy})")]
+
+
+def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
+    found = localizer.localize_features(prepared.features, prepared.query.camera)
+    return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))
+
+
+def errors_of(map: Map, queries: Sequence[PreparedQuery], found: Sequence[Localization]) -> list[PoseError]:
+    """Compare what was found with the truth."""
+    return [
+        pose_error(one.pose and one.pose.cam_from_world, prepared.query.cam_from_world, map.box)
+        for prepared, one in zip(queries, found, strict=True)
+    ]
+
+
+def evaluate(
+    map: Map,
+    queries: Sequence[PreparedQuery],
+    label: tuple[str, str, str],
+    *,
+    map_bytes: int,
+    progress: ProgressBar = silent,
+) -> Row:
+    """Localize queries against one map and sum up.
+
+    Args:
+        map: The map.
+        queries: The queries.
+        label: Name of the object, the strategy to use, and name of the variant that the map is.
+        map_bytes: Size of the map on disk.
+        progress: Told of each query.
+    """
+    name, strategy, variant = label
+    found = localize_all(map, queries, strategy, progress)
+    errors = errors_of(map, queries, found)
+    return Row(
+        object=name,
+        strategy=strategy,
+        variant=variant,
+        references=len(map.images),
+        points=len(map.point3D_ids),
+        map_bytes=map_bytes,
+        scores=score(errors, found, metric=map.info.unit == "metre"),
+    )

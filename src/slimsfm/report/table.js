@@ -1,0 +1,22 @@
+"use strict";
+// A click on a header sorts its table: numbers largest first, text alphabetically, a second click reversed.
+for (const table of document.querySelectorAll("table")) {
+  const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
+  heads.forEach((head, column) => head.addEventListener("click", () => {
+    const numeric = body.rows[0].cells[column].classList.contains("number");
+    const first = numeric ? "descending" : "ascending", second = numeric ? "ascending" : "descending";
+    const order = head.getAttribute("aria-sort") === first ? second : first;
+    heads.forEach(other => other.removeAttribute("aria-sort"));
+    head.setAttribute("aria-sort", order);
+    const sign = order === "ascending" ? 1 : -1;
+    body.append(...[...body.rows].sort((a, b) => sign * compare(a.cells[column], b.cells[column], numeric, sign)));
+  }));
+}
+
+function compare(a, b, numeric, sign) {
+  if (!numeric) return a.textContent.localeCompare(b.textContent);
+  const missing = sign * Infinity; // a dash comes last either way
+  const x = "value" in a.dataset ? Number(a.dataset.value) : missing;
+  const y = "value" in b.dataset ? Number(b.dataset.value) : missing;
+  return x === y ? 0 : x < y ? -1 : 1;
+}

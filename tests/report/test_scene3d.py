@@ -1,0 +1,86 @@
+import base64
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+
+from slimsfm.report.scene3d import scene, view_frame
+
+
+def points_of(shown):
+    return np.frombuffer(base64.b64decode(shown["points"]), "<f4").reshape(-1, 3)
+
+
+def colors_of(shown):
+    return np.frombuffer(base64.b64decode(shown["colors"]), np.uint8).reshape(-1, 3)
+
+
+def poses_of(map):
+    return [image.cam_from_world() for image in map.images.values()]
+
+
+def test_the_view_keeps_shape_and_puts_the_box_in_the_middle(full, reduced):
+    shown = scene(full, reduced)
+    corners = np.array(shown["box"])
+    np.testing.assert_allclose(corners.mean(axis=0), 0, atol=1e-4)
+    between = np.linalg.norm(corners[:, None] - corners[None], axis=2)
+    expected = np.linalg.norm(full.box.corners[:, None] - full.box.corners[None], axis=2) / full.box.diagonal
+    np.testing.assert_allclose(between, expected, atol=5e-4)
+    points = points_of(shown["before"])
+    to_corners = np.linalg.norm(points[:, None] - corners[None], axis=2) * full.box.diagonal
+    in_world = np.linalg.norm(full.points3D_in_world[:, None] - full.box.corners[None], axis=2)
+    np.testing.assert_allclose(to_corners, in_world, atol=1e-3)
+
+
+def test_the_view_is_right_handed_with_the_images_upright_and_the_cameras_ahead(full):
+    frame = view_frame(poses_of(full), full.box)
+    rotation = frame.view_from_world * full.box.diagonal
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    ups = [rotation @ -pose.rotation.matrix()[1] for pose in poses_of(full)]
+    np.testing.assert_allclose(ups, np.tile([0, 0, 1], (4, 1)), atol=1e-6)
+    middle = frame.apply(np.array([pose.inverse().translation for pose in poses_of(full)])).mean(axis=0)
+    assert middle[0] > 1
+    assert middle[1] == pytest.approx(0, abs=1e-9)
+
+
+def test_opposite_cameras_still_give_a_view(full):
+    about_x = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([np.pi, 0, 0])), np.zeros(3))
+    frame = view_frame([pycolmap.Rigid3d(), about_x], full.box)
+    rotation = frame.view_from_world * full.box.diagonal
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_frusta_look_from_the_camera_at_what_it_sees(full, reduced):
+    shown = scene(full, reduced)
+    frame = view_frame(poses_of(full), full.box)
+    for frustum, pose in zip(shown["before"]["images"], poses_of(full), strict=True):
+        center, *corners = np.array(frustum)
+        np.testing.assert_allclose(center, frame.apply(pose.inverse().translation[None])[0], atol=1e-4)
+        axis = np.mean(corners, axis=0) - center  # these cameras look at the box's centre, here the origin
+        assert axis @ -center == pytest.approx(np.linalg.norm(axis) * np.linalg.norm(center), rel=1e-3)
+
+
+def test_chosen_images_are_those_of_the_reduced_map(full, reduced):
+    shown = scene(full, reduced)
+    assert shown["before"]["chosen"] == [0, 1, 0, 0]
+    assert shown["after"]["chosen"] == [1]
+    assert shown["after"]["images"][0] == shown["before"]["images"][1]
+    np.testing.assert_array_equal(points_of(shown["after"]), points_of(shown["before"])[:20])
+    np.testing.assert_array_equal(colors_of(shown["before"]), full.colors)
+
+
+def test_many_points_are_thinned_out_evenly(full, reduced):
+    everything = points_of(scene(full, reduced)["before"])
+    shown = scene(full, reduced, max_points=10)["before"]
+    rows = [int(np.flatnonzero((everything == point).all(axis=1))[0]) for point in points_of(shown)]
+    assert len(colors_of(shown)) == len(rows) == 10
+    assert rows[0] == 0
+    assert rows[-1] == 29
+    assert set(np.diff(rows)) <= {3, 4}
+
+
+def test_the_scene_is_plain_json(full, reduced):
+    shown = scene(full, reduced)
+    assert json.loads(json.dumps(shown, allow_nan=False))["before"] == shown["before"]

@@ -1,0 +1,82 @@
+"""A tiny exact scene: points on and in a box, cameras around it, keypoints where the points project."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+
+from slimsfm.features import Features
+from slimsfm.geometry import Box, project
+from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.synthetic.trajectory import look_at
+
+BOX = Box(np.zeros(3), np.diag([1.0, 0.8, 0.6]))
+
+
+def camera(model: str = "OPENCV") -> pycolmap.Camera:
+    made = pycolmap.Camera.create_from_model_name(1, model, 500.0, 640, 480)
+    if model == "OPENCV":
+        made.params = np.array([500.0, 505.0, 322.0, 238.0, -0.08, 0.02, 0.001, -0.001])
+    return made
+
+
+def poses(count: int) -> list[pycolmap.Rigid3d]:
+    """Cameras on a ring around the box, alternately low and high."""
+    angles = 2 * np.pi * np.arange(count) / count
+    eyes = [np.array([5 * np.cos(a), 5 * np.sin(a), 1.5 + (i % 2)]) for i, a in enumerate(angles)]
+    return [look_at(eye, np.zeros(3)) for eye in eyes]
+
+
+def exact_map(num_images: int = 6, num_points: int = 120, seed: int = 0, reach_deg: float = 180.0) -> Map:
+    """A map without any error, whose points are seen by the cameras within `reach_deg` of their own direction.
+
+    Each point has a descriptor of its own, equal in every image; each image has 20 more keypoints that see
+    nothing.
+    """
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (num_points, 3)) @ BOX.half_edges
+    descriptors = _unit(rng.normal(size=(num_points, 32)))
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera())
+    features, seen_by = {}, {i: pycolmap.Track() for i in range(num_points)}
+    for image_id, cam_from_world in enumerate(poses(num_images), start=1):
+        eye = cam_from_world.inverse().translation
+        cosines = (points @ eye) / (np.linalg.norm(points, axis=1) * np.linalg.norm(eye))
+        seen = np.flatnonzero(cosines >= np.cos(np.radians(reach_deg)))
+        keypoints = np.concatenate(
+            [project(points[seen], cam_from_world, camera()), rng.uniform(10, 470, (20, 2))]
+        )
+        name = f"{image_id:03d}.png"
+        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=1, image_id=image_id)
+        model.add_image_with_trivial_frame(image, cam_from_world)
+        for row, point in enumerate(seen):
+            seen_by[int(point)].add_element(image_id, row)
+        features[name] = Features(
+            keypoints=keypoints.astype(np.float32),
+            descriptors=np.concatenate([descriptors[seen], _unit(rng.normal(size=(20, 32)))]).astype(
+                np.float32
+            ),
+            scores=np.ones(len(keypoints), np.float32),
+            image_size=(640, 480),
+        )
+    for point, track in seen_by.items():
+        if track.length() >= 2:
+            model.add_point3D(points[point], track, np.array([200, 100, 50], np.uint8))
+    info = MapInfo(extractor="sift", box=BOX, box_source="given", unit="metre", origin="made by the tests")
+    return Map(model=model, features=features, info=info)
+
+
+def with_matches(map_: Map) -> Map:
+    """The same map with the matches between consecutive images that its tracks imply."""
+    names = list(map_.images)
+    matches = {}
+    for a, b in zip(names[:-1], names[1:], strict=True):
+        of_a, of_b = map_.observations[a], map_.observations[b]
+        _, rows_a, rows_b = np.intersect1d(of_a.points, of_b.points, return_indices=True)
+        pairs = np.stack([of_a.rows[rows_a], of_b.rows[rows_b]], axis=1)
+        matches[a, b] = pairs[np.argsort(pairs[:, 0])]
+    return replace(map_, matches=matches)
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
