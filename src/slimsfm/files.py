@@ -14,11 +14,14 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
     Raises:
         OutputError: The output exists and `overwrite` is off, or its parent is not a folder.
     """
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; choose another output or pass --overwrite")
-    parent = path.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
+    try:
+        if path.exists() and not overwrite:
+            raise OutputError(f"{path}: exists already; choose another output or pass --overwrite")
+        parent = path.absolute().parent
+        while not parent.exists():
+            parent = parent.parent
+    except OSError as error:
+        raise _cannot_write(path, error) from error
     if not parent.is_dir():
         raise OutputError(f"{path}: {parent} is not a folder, so nothing can be written there")
 
@@ -38,34 +41,35 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[Path]:
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         remove(partial)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    try:
         yield partial
         _swap(partial, path)
     except OSError as error:
-        if error.filename is not None and not _within(Path(str(error.filename)), partial):
+        if error.filename is not None and not Path(str(error.filename)).absolute().is_relative_to(partial):
             raise  # reading something else failed: not ours to explain
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); nothing was kept"
-        ) from error
+        raise _cannot_write(path, error) from error
     finally:
         remove(partial)
+
+
+def _cannot_write(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"{path}: cannot be written ({error.strerror or error}); nothing was kept")
 
 
 def _swap(partial: Path, path: Path) -> None:
     old = partial.with_suffix(".old")
     remove(old)
-    if path.exists():
-        path.rename(old)
     try:
+        if path.exists():
+            path.rename(old)
         partial.rename(path)
-    except OSError:
-        if old.exists():
+    except BaseException:  # an interruption, too, must not leave the place empty
+        if old.exists() and not path.exists():
             old.rename(path)
         raise
     remove(old)
-
-
-def _within(path: Path, partial: Path) -> bool:
-    return path.absolute().is_relative_to(partial.parent)
 
 
 def remove(path: Path) -> None:

@@ -12,6 +12,15 @@ from slimsfm.errors import ImageError, InputError
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 
+_UNREADABLE = (
+    UnidentifiedImageError,
+    PillowImage.DecompressionBombError,
+    OSError,
+    ValueError,
+    SyntaxError,
+    RuntimeError,
+)
+
 
 def list_images(folder: Path) -> list[str]:
     """Names of the images below a folder, relative to it, with forward slashes, sorted.
@@ -40,7 +49,7 @@ def read_image(path: Path) -> Image:
             return np.array(ImageOps.exif_transpose(file).convert("RGB"))
     except FileNotFoundError as error:
         raise ImageError(f"{path}: no such image") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except _UNREADABLE as error:
         raise ImageError(f"{path}: not a readable image; remove or replace it") from error
 
 
@@ -68,7 +77,7 @@ def camera_from_exif(path: Path) -> pycolmap.Camera:
         with PillowImage.open(path) as file:
             turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
             upright_size = file.size[::-1] if turned else file.size
-    except (UnidentifiedImageError, OSError, ValueError, RuntimeError) as error:
+    except _UNREADABLE as error:
         raise ImageError(f"{path}: not a readable image; remove or replace it") from error
     guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
     guess.has_prior_focal_length = camera.has_prior_focal_length

@@ -73,12 +73,15 @@ def estimate_pose(
         The pose, or None when no hypothesis has enough inliers.
 
     Raises:
-        ValueError: The rows do not correspond, or a coordinate is not finite.
+        ValueError: The rows do not correspond, a coordinate is not finite, or the camera is spherical: it has
+            no focal length, which the pinhole solver needs.
 
     References:
         [1] Chum, Matas and Kittler, Locally Optimized RANSAC, DAGM 2003.
     """
     _check_matches(points2D, points3D_in_world)
+    if camera.is_spherical():
+        raise ValueError(f"camera must have a focal length, got the spherical model {camera.model_name}")
     if len(points2D) < options.min_inliers:
         return None
     pinhole_points2D = _undistort(points2D, camera)

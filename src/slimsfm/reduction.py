@@ -29,6 +29,8 @@ class ReductionOptions:
             raise ValueError(f"threshold must be positive, got {self.threshold}")
         if self.solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(sorted(SOLVERS))}, got {self.solver!r}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

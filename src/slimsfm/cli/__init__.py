@@ -56,6 +56,8 @@ def run(arguments: list[str]) -> int:
             import_module(f"slimsfm.cli.{name}_command").main(rest)
     except SlimsfmError as error:
         return _fail(str(error))
+    except SystemExit as end:  # --help
+        return int(end.code or 0)
     except KeyboardInterrupt:
         print("slimsfm: interrupted; nothing half-made was left behind", file=sys.stderr)
         return 130

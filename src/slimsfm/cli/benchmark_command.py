@@ -46,7 +46,7 @@ def benchmark_images(
     references = hold_out(truth, names)
     graph = graph_of(references, output / "graph.npz", progress=shown)
     queries = [
-        Query(path=images / n, camera=truth.images[n].camera, cam_from_world=truth.images[n].cam_from_world())
+        Query(path=images / n, camera=truth.camera(n), cam_from_world=truth.images[n].cam_from_world())
         for n in names
     ]
     prepared = prepare(references, queries, shown)

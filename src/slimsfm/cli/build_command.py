@@ -5,8 +5,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.output import Flat, ImagesPath, OutputPath, Stopwatch, console, counts, finish, parse
-from slimsfm.files import check_writable
+from slimsfm.cli.output import (
+    Flat,
+    ImagesPath,
+    OutputPath,
+    Stopwatch,
+    check_output,
+    console,
+    counts,
+    finish,
+    parse,
+)
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -28,7 +37,7 @@ def build_photos(
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
-    check_writable(output, overwrite=overwrite)
+    check_output(output, images, overwrite=overwrite)
     with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
         made = build_map(images, Path(workspace), build, progress=shown)
         write_map(made.map, output, overwrite=overwrite)

@@ -3,8 +3,17 @@
 from collections.abc import Sequence
 from typing import Annotated
 
-from slimsfm.cli.output import Flat, ModelPath, OutputPath, Stopwatch, console, counts, finish, parse
-from slimsfm.files import check_writable
+from slimsfm.cli.output import (
+    Flat,
+    ModelPath,
+    OutputPath,
+    Stopwatch,
+    check_output,
+    console,
+    counts,
+    finish,
+    parse,
+)
 from slimsfm.mapping.importing import ImportOptions, import_model
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -26,7 +35,7 @@ def import_(
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
-    check_writable(output, overwrite=overwrite)
+    check_output(output, model, overwrite=overwrite)
     made = import_model(model, source, progress=shown)
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")

@@ -6,8 +6,17 @@ from typing import Annotated
 
 import numpy as np
 
-from slimsfm.cli.output import Flat, ImagesPath, MapPath, OutputPath, Stopwatch, console, finish, parse
-from slimsfm.files import check_writable
+from slimsfm.cli.output import (
+    Flat,
+    ImagesPath,
+    MapPath,
+    OutputPath,
+    Stopwatch,
+    check_output,
+    console,
+    finish,
+    parse,
+)
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import query_camera, read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
@@ -36,7 +45,8 @@ def localize(
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
-    check_writable(output, overwrite=overwrite)
+    check_output(output, map, overwrite=overwrite)
+    check_output(output, images, overwrite=overwrite)
     writer_for(output)
     given = read_camera(camera) if camera else None
     map_ = read_map(map)

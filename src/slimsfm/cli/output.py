@@ -1,7 +1,11 @@
 """What the commands share in parsing and printing."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
+from functools import partial, wraps
+from io import StringIO
+from itertools import takewhile
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, TypeVar
@@ -11,8 +15,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from slimsfm.errors import InputError, OutputError
 from slimsfm.evaluation.metrics import DEG_CM
 from slimsfm.evaluation.table import Row
+from slimsfm.files import check_writable
 from slimsfm.mapping.map import Map
 
 Result = TypeVar("Result")
@@ -27,18 +33,50 @@ MapPath = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MAP")]
 ImagesPath = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
 ModelPath = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL")]
 
-console = Console(highlight=False, soft_wrap=True)
+_WIDTH = 170  # of the widest table; narrower terminals wrap lines themselves, which cuts no figure off
+
+console = Console(highlight=False, soft_wrap=True, width=_WIDTH)
 
 
 def parse(command: Callable[..., Result], arguments: Sequence[str]) -> Result:
-    """Call a command with what the arguments say; its signature is the command line."""
+    """Call a command with what the arguments say; its signature is the command line.
+
+    Raises:
+        InputError: An argument is missing, unknown or of a value that its options refuse.
+    """
     name = command.__module__.rpartition(".")[2].removesuffix("_command")
-    return tyro.cli(
-        command,
-        prog=f"slimsfm {name}",
-        args=list(arguments),
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+
+    @wraps(command)
+    def bound(*args: Any, **kwargs: Any) -> Callable[[], Result]:
+        return partial(command, *args, **kwargs)
+
+    config = (tyro.conf.FlagCreatePairsOff,)
+    with redirect_stderr(StringIO()) as said:
+        try:
+            call = tyro.cli(bound, prog=f"slimsfm {name}", args=list(arguments), config=config)
+        except SystemExit as end:
+            if not end.code:
+                raise  # --help
+            raise InputError(f"{_in_one_line(said.getvalue())}; see slimsfm {name} --help") from None
+    return call()
+
+
+def _in_one_line(boxed: str) -> str:
+    """What stands in tyro's box above its first rule, without the name that our functions give to options."""
+    lines = [line.strip("│ ") for line in boxed.splitlines() if line.startswith("│")]
+    message = " ".join(takewhile(lambda line: not line.startswith("─"), lines))
+    return re.sub(r"^Error parsing [a-z][\w.]*: ", "", message) or boxed
+
+
+def check_output(output: Path, source: Path, *, overwrite: bool) -> None:
+    """Refuse, before any work is done, an output that cannot be written or would replace what it is made of.
+
+    Raises:
+        OutputError: It exists and `overwrite` is off, has no folder to lie in, or is or holds the source.
+    """
+    if source.resolve().is_relative_to(output.resolve()):
+        raise OutputError(f"{output}: is or holds the input {source}; choose another output")
+    check_writable(output, overwrite=overwrite)
 
 
 @contextmanager
@@ -92,6 +130,11 @@ def print_rows(rows: Sequence[Row]) -> None:
     for row in rows:
         table.add_row(*_cells(row, metric=metric, several=several))
     console.print(table)
+    console.print(
+        "0.1d, 0.05d, 0.02d: % of queries whose box corners are off by less than this share of the diagonal d; "
+        "median: of that error; found: % with any pose",
+        style="dim",
+    )
     if not metric:
         console.print("n°-n cm: not given, for the unit of the map is unknown", style="dim")
 
@@ -101,7 +144,7 @@ def _header(*, metric: bool, several: bool) -> list[str]:
         *(["object"] if several else []),
         *("strategy", "variant", "images", "points", "size"),
         *([f"{n}°-{n}cm" for n in DEG_CM] if metric else []),
-        *("0.1d", "0.05d", "0.02d", "median error", "localized", "extract", "match", "pose", "FPS"),
+        *("0.1d", "0.05d", "0.02d", "median", "found", "extract", "match", "pose", "FPS"),
     ]
 
 
@@ -112,7 +155,7 @@ def _cells(row: Row, *, metric: bool, several: bool) -> list[str]:
         *(row.strategy, row.variant, f"{row.references:.0f}", f"{row.points:.0f}", size(row.map_bytes)),
         *([f"{share:.1f}" for share in (scores.deg_cm or {}).values()] if metric else []),
         *(f"{share:.1f}" for share in scores.add.values()),
-        *(f"{scores.median_corner_error:.4f} d", f"{scores.localized:.1f}"),
+        *(f"{scores.median_corner_error:.4f}d", f"{scores.localized:.1f}"),
         *(f"{1e3 * part:.0f} ms" for part in (seconds.extract, seconds.match, seconds.pose)),
         f"{scores.fps:.1f}",
     ]

@@ -6,9 +6,19 @@ from typing import Annotated
 
 from rich.table import Table
 
-from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, console, counts, finish, parse, size
-from slimsfm.errors import InputError, OutputError
-from slimsfm.files import check_writable
+from slimsfm.cli.output import (
+    Flat,
+    MapPath,
+    OutputPath,
+    Stopwatch,
+    check_output,
+    console,
+    counts,
+    finish,
+    parse,
+    size,
+)
+from slimsfm.errors import InputError
 from slimsfm.graph.io import graph_of
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import Map
@@ -37,9 +47,7 @@ def reduce(
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
-    check_writable(output, overwrite=overwrite)
-    if output.absolute() == map.absolute():
-        raise OutputError(f"{output}: is the map to be reduced; choose another output")
+    check_output(output, map, overwrite=overwrite)
     if images and random is not None:
         raise InputError("--images and --random exclude each other")
     full = read_map(map)

@@ -77,7 +77,7 @@ class Scores:
     """Percentage within each of `ADD_FRACTIONS` of the diagonal."""
 
     median_corner_error: float
-    """Relative; infinite where fewer than half are localized."""
+    """Relative; infinite unless more than half are localized."""
 
     deg_cm: dict[int, float] | None
     """Percentage within n degrees and n cm for each of `DEG_CM`; None where the unit is unknown."""

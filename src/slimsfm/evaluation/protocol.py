@@ -60,7 +60,13 @@ def prepare(map: Map, queries: Sequence[Query], progress: ProgressBar = silent) 
 def localize_all(
     map: Map, queries: Sequence[PreparedQuery], strategy: str, progress: ProgressBar = silent
 ) -> list[Localization]:
-    """Localize queries one after the other, after one that is not timed and finds every cache cold."""
+    """Localize queries one after the other, after one that is not timed and finds every cache cold.
+
+    Raises:
+        ValueError: There is no query.
+    """
+    if not queries:
+        raise ValueError("queries must hold at least one query")
     localizer = Localizer(map, LocalizationOptions(strategy=strategy))
     localizer.localize_features(queries[0].features, queries[0].query.camera)
     return [_localize(localizer, query) for query in progress(queries, f"localize queries ({strategy})")]

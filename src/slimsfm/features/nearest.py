@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import Descriptors, IndexPairs
+from slimsfm.arrays import IndexPairs
+
+_BLOCK = 256  # rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,25 +34,44 @@ def match_nearest(
 ) -> IndexPairs:
     """Match two sets of descriptors of unit length, as COLMAP does: mutual nearest, ratio test on angles.
 
-    Each row of one set is matched at most once. The ratio test applies on the side of `descriptors1`.
-    Complexity: O(n m d), one matrix product.
+    Each row of either set is matched at most once. The ratio test applies on the side of `descriptors1`.
+    Complexity: O(n m d), one matrix product, taken in blocks of rows that stay in the processor's cache.
 
     Returns:
         Pairs (row of `descriptors1`, row of `descriptors2`), sorted by the first.
     """
     if len(descriptors1) == 0 or len(descriptors2) == 0:
         return np.zeros((0, 2), np.int64)
-    similarities = descriptors1 @ descriptors2.T
-    nearest2 = similarities.argmax(axis=1)
-    rows = np.arange(len(descriptors1))
-    mutual = similarities.argmax(axis=0)[nearest2] == rows
-    rows, nearest2 = rows[mutual], nearest2[mutual]
-    best = _angles(similarities[rows, nearest2])
-    similarities[rows, nearest2] = -1
-    second = _angles(similarities[rows].max(axis=1)) if len(descriptors2) > 1 else np.full(len(rows), np.inf)
-    good = (best <= options.max_ratio * second) & (best <= options.max_distance)
-    return np.stack([rows[good], nearest2[good]], axis=1).astype(np.int64)
+    nearest, best, second, best_of_column = _nearest_two(descriptors1, descriptors2)
+    angles = _angles(best)
+    good = (angles <= options.max_ratio * _angles(second)) & (angles <= options.max_distance)
+    rows = np.flatnonzero(good & (best >= best_of_column[nearest]))
+    _, first = np.unique(nearest[rows], return_index=True)  # equal descriptors: the first takes the match
+    rows = rows[np.sort(first)]
+    return np.stack([rows, nearest[rows]], axis=1)
 
 
-def _angles(cosines: Descriptors | np.ndarray) -> np.ndarray:
+def _nearest_two(
+    descriptors1: Float32[np.ndarray, "n d"], descriptors2: Float32[np.ndarray, "m d"]
+) -> tuple[
+    Int64[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " m"]
+]:
+    """Each row's nearest of the other set, its cosine, that of the second nearest, and each column's best."""
+    nearest = np.empty(len(descriptors1), np.int64)
+    best, second = np.empty((2, len(descriptors1)), np.float32)
+    best_of_column = np.full(len(descriptors2), -np.inf, np.float32)
+    transposed = np.ascontiguousarray(descriptors2.T)
+    for start in range(0, len(descriptors1), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        cosines = descriptors1[block] @ transposed
+        rows = np.arange(len(cosines))
+        nearest[block] = cosines.argmax(axis=1)
+        best[block] = cosines[rows, nearest[block]]
+        np.maximum(best_of_column, cosines.max(axis=0), out=best_of_column)
+        cosines[rows, nearest[block]] = -1
+        second[block] = cosines.max(axis=1)
+    return nearest, best, second, best_of_column
+
+
+def _angles(cosines: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
     return np.arccos(np.clip(cosines, -1, 1))

@@ -56,7 +56,7 @@ class Sift:
         scale = min(1.0, self.max_image_size / max(height, width))
         gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), scale)
         small_mask = None if mask is None else _shrink(mask, scale)
-        detector = cv2.SIFT_create(
+        detector = cv2.SIFT.create(
             self.max_features, contrastThreshold=self.contrast_threshold, enable_precise_upscale=True
         )
         found, descriptors = detector.detectAndCompute(gray, small_mask)

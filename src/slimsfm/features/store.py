@@ -38,9 +38,14 @@ class FeatureFile(Mapping[str, Features]):
         if name not in self._names:
             raise KeyError(name)
         try:
-            return _read_features(self._file[name])
-        except (KeyError, OSError, ValueError) as error:
+            return _read_features(self._file, name)
+        except (KeyError, OSError, TypeError, ValueError) as error:
             raise InputError(f"{self._path}: the features of {name!r} are damaged ({error})") from error
+
+    def count(self, name: str) -> int:
+        """How many features an image has, without reading them."""
+        keypoints = self._file[name]["keypoints"]
+        return keypoints.shape[0] if isinstance(keypoints, h5py.Dataset) and keypoints.shape else 0
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -49,18 +54,28 @@ class FeatureFile(Mapping[str, Features]):
         return len(self._names)
 
 
-def _read_features(group: h5py.Group) -> Features:
-    keypoints = np.asarray(group["keypoints"], np.float32)
-    descriptors = np.asarray(group["descriptors"]).T
-    if keypoints.ndim != 2 or descriptors.ndim != 2 or len(keypoints) != len(descriptors):
+def _array(file: h5py.File, name: str) -> np.ndarray:
+    """The values of a data set; KeyError where there is none."""
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        raise KeyError(f"{name} is no data set")
+    return found[()]
+
+
+def _read_features(file: h5py.File, name: str) -> Features:
+    keypoints = _array(file, f"{name}/keypoints").astype(np.float32)
+    descriptors = _array(file, f"{name}/descriptors").T
+    scores = _array(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
+    if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
         raise ValueError(f"{keypoints.shape} keypoints with {descriptors.T.shape} descriptors")
-    scores = np.asarray(group["scores"]) if "scores" in group else np.ones(len(keypoints))
-    width, height = (int(side) for side in group["image_size"]) if "image_size" in group else (0, 0)
+    if not len(keypoints) == len(descriptors) == len(scores):
+        raise ValueError(f"{len(keypoints)} keypoints, {len(descriptors)} descriptors, {len(scores)} scores")
+    size = _array(file, f"{name}/image_size") if f"{name}/image_size" in file else np.zeros(2)
     return Features(
         keypoints=np.ascontiguousarray(keypoints[:, :2]) + _PIXEL_CENTER,
         descriptors=np.ascontiguousarray(descriptors),
         scores=scores.astype(np.float32),
-        image_size=(width, height),
+        image_size=(int(size[0]), int(size[1])),
     )
 
 
@@ -68,6 +83,9 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
     """The verified matches of a file by pair of image names, read when asked for.
 
     Each pair has one entry, in the order in which the file names it.
+
+    Raises:
+        InputError: The file is missing or no such file, at construction; an entry is damaged, at access.
     """
 
     def __init__(self, path: Path, names: list[str]) -> None:
@@ -76,11 +94,15 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
         by_key = {_key(name): name for name in names}
         groups = (group.split("/") for group in _groups_with(self._file, "matches0"))
         pairs = ((by_key.get(group[0]), by_key.get(group[-1])) for group in groups)
-        self._pairs = sorted((a, b) for a, b in pairs if a is not None and b is not None)
+        self._pairs = dict.fromkeys(sorted((a, b) for a, b in pairs if a is not None and b is not None))
 
     def __getitem__(self, pair: tuple[str, str]) -> IndexPairs:
-        group = self._file[f"{_key(pair[0])}/{_key(pair[1])}"]
-        targets = np.asarray(group["matches0"], np.int64)
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        try:
+            targets = _array(self._file, f"{_key(pair[0])}/{_key(pair[1])}/matches0").astype(np.int64)
+        except (KeyError, OSError, TypeError, ValueError) as error:
+            raise InputError(f"{self._path}: the matches of {pair} are damaged ({error})") from error
         rows = np.flatnonzero(targets >= 0)
         return np.stack([rows, targets[rows]], axis=1)
 

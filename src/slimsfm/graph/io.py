@@ -15,13 +15,14 @@ from slimsfm.progress import ProgressBar, silent
 
 def graph_key(map: Map, options: GraphOptions) -> str:
     """Equal for equal maps and options: a graph is reused only where its key is that of the work asked for."""
-    digest = hashlib.sha256(repr(options).encode())
+    digest = hashlib.sha256(repr((options, map.info.extractor, map.info.extractor_options)).encode())
     digest.update(map.box.corners.tobytes())
     digest.update(map.point3D_ids.tobytes())
     digest.update(map.points3D_in_world.tobytes())
     for name, image in map.images.items():
         digest.update(name.encode())
         digest.update(image.cam_from_world().matrix().tobytes())
+        digest.update(image.camera.model_name.encode() + image.camera.params.tobytes())
         digest.update(map.observations[name].rows.tobytes())
         digest.update(map.observations[name].points.tobytes())
     return digest.hexdigest()
@@ -40,7 +41,7 @@ def read_graph(path: Path, key: str) -> ReferenceGraph | None:
             if str(stored["key"]) != key:
                 return None
             return ReferenceGraph(names=tuple(stored["names"].tolist()), errors=stored["errors"])
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, RuntimeError):
         return None  # computed again and replaced
 
 

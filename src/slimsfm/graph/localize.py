@@ -68,7 +68,7 @@ def _reference(map: Map, name: str) -> _Reference:
         descriptors=unit_rows(features.descriptors),
         rows=seen.rows,
         points=seen.points,
-        camera=image.camera,
+        camera=map.camera(name),
         cam_from_world=image.cam_from_world(),
     )
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from slimsfm.errors import ImageError, InputError
@@ -25,17 +26,22 @@ def read_camera(path: Path) -> pycolmap.Camera:
     try:
         (camera,) = cameras
         camera_id, model, width, height, *params = camera
-        return pycolmap.Camera(
-            camera_id=int(camera_id),
-            model=model,
-            width=int(width),
-            height=int(height),
-            params=[float(p) for p in params],
-        )
+        read = pycolmap.Camera.create_from_model_name(int(camera_id), model, 1.0, int(width), int(height))
+        read.params = np.array([float(p) for p in params])
+        if _is_usable(read):
+            return read
+        raise ValueError("not this model's parameters")
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise InputError(
             f"{path}: should hold one line `ID MODEL WIDTH HEIGHT PARAMS...` as COLMAP's cameras.txt has it"
         ) from error
+
+
+def _is_usable(camera: pycolmap.Camera) -> bool:
+    if not camera.verify_params() or min(camera.width, camera.height) < 1:
+        return False
+    focal_lengths = camera.params[camera.focal_length_idxs()]
+    return bool(np.all(np.isfinite(camera.params)) and len(focal_lengths) and np.all(focal_lengths > 0))
 
 
 def scaled_camera(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.Camera | None:

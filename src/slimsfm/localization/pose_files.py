@@ -99,7 +99,7 @@ def _write_tum(file: TextIO, results: Results) -> None:
         if one.pose:
             world_from_cam = one.pose.cam_from_world.inverse()
             values = [*world_from_cam.translation, *world_from_cam.rotation.quat]
-            file.write(f"{index} " + " ".join(f"{value:.9g}" for value in values) + "\n")
+            file.write(f"{index} " + " ".join(repr(float(value)) for value in values) + "\n")
 
 
 def _write_colmap(file: TextIO, results: Results) -> None:

@@ -1,1 +1,22 @@
 """Maps: what they are, how they are read, written, built, imported and cut down to some images."""
+
+from slimsfm.mapping.build import Build, BuildOptions, KnownPoses, build_map
+from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.io import read_map, write_map
+from slimsfm.mapping.map import Map, MapInfo, Observations
+from slimsfm.mapping.subset import keep_images
+
+__all__ = [
+    "Build",
+    "BuildOptions",
+    "ImportOptions",
+    "KnownPoses",
+    "Map",
+    "MapInfo",
+    "Observations",
+    "build_map",
+    "import_model",
+    "keep_images",
+    "read_map",
+    "write_map",
+]

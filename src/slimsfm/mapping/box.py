@@ -28,7 +28,7 @@ def read_box(path: Path) -> Box:
             data = json.loads(path.read_text())
             corners = np.array(data["corners"] if isinstance(data, dict) else data, np.float64)
         else:
-            corners = np.loadtxt(path, dtype=np.float64, ndmin=2)
+            corners = np.array([line.split() for line in path.read_text().splitlines()], np.float64)
         return Box.from_corners(corners)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such box file") from error
@@ -68,7 +68,8 @@ def _centrality(model: pycolmap.Reconstruction, ids: Ids) -> Float64[np.ndarray,
         image = model.image(image_id)
         seen = image.get_observation_points2D()
         pixels = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
-        size = np.array([image.camera.width, image.camera.height])
+        camera = model.camera(image.camera_id)
+        size = np.array([camera.width, camera.height])
         squared = (((pixels - size / 2) / (_SPREAD * size.min())) ** 2).sum(axis=1)
         rows = np.searchsorted(ids, np.array([point.point3D_id for point in seen], np.int64))
         weights[rows] += np.exp(-squared / 2)

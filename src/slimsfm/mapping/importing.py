@@ -13,7 +13,7 @@ from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
 from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.model import read_model
+from slimsfm.mapping.model import camera_of, read_model
 from slimsfm.mapping.redescribe import redescribe
 from slimsfm.mapping.sfm import verified_matches
 from slimsfm.progress import ProgressBar, silent
@@ -116,7 +116,9 @@ def _database_beside(model_path: Path) -> Path:
 def _from_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
     if not path.is_file():
         raise InputError(f"{path}: no such database")
-    if path.read_bytes()[:16] != b"SQLite format 3\0":
+    with path.open("rb") as file:
+        header = file.read(16)
+    if header != b"SQLite format 3\0":
         raise InputError(f"{path}: not a COLMAP database")
     with pycolmap.Database.open(path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -146,11 +148,12 @@ def _read_database_features(
     stored = database.read_descriptors(image_id)
     is_sift = stored.type in (pycolmap.FeatureExtractorType.SIFT, pycolmap.FeatureExtractorType.UNDEFINED)
     data = np.asarray(stored.data, np.uint8)
+    camera = camera_of(image)
     features = Features(
         keypoints=np.ascontiguousarray(keypoints),
         descriptors=data if is_sift else data.view(np.float32),
         scores=np.ones(len(keypoints), np.float32),
-        image_size=(image.camera.width, image.camera.height),
+        image_size=(camera.width, camera.height),
     )
     return features, "sift" if is_sift else stored.type.name.lower().split("_")[0]
 
@@ -185,17 +188,18 @@ def _consistent_matches(
 ) -> dict[tuple[str, str], IndexPairs]:
     """hloc's matches are not verified: keep those that fit the epipolar geometry of the model's poses."""
     images = {image.name: image for image in _posed_images(model)}
+    cameras = {name: camera_of(image) for name, image in images.items()}
     verified = {}
     for a, b in raw:
         pairs = raw[a, b]
         rays = [
-            np.asarray(images[name].camera.cam_from_img(features[name].keypoints[column].astype(np.float64)))
+            np.asarray(cameras[name].cam_from_img(features[name].keypoints[column].astype(np.float64)))
             for name, column in ((a, pairs[:, 0]), (b, pairs[:, 1]))
         ]
         b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
         essential = pycolmap.essential_matrix_from_pose(b_from_a)
         squared = np.asarray(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
-        focal = min(images[a].camera.mean_focal_length(), images[b].camera.mean_focal_length())
+        focal = min(cameras[a].mean_focal_length(), cameras[b].mean_focal_length())
         good = pairs[squared * focal**2 < _MAX_EPIPOLAR_ERROR_PX**2]
         if len(good) >= _MIN_INLIERS:
             verified[a, b] = good

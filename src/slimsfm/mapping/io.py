@@ -16,7 +16,7 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing
 from slimsfm.geometry import Box
-from slimsfm.mapping.map import Map, MapInfo, check_map
+from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
 
 FORMAT_VERSION = 1
@@ -42,6 +42,8 @@ def read_map(path: Path) -> Map:
             info=info,
         )
         check_map(map_)
+        for name, image in map_.images.items():
+            check_count(image, features.count(name))
     except InputError as error:
         raise MapError(f"{path}: not a usable map: {error}") from error
     return map_
@@ -59,8 +61,10 @@ def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
         (partial / "sparse").mkdir(parents=True)
         map.model.write(partial / "sparse")
         with FeatureWriter(partial / "features.h5") as writer:
-            for name in map.images:
-                writer.write(name, map.features[name])
+            for name, image in map.images.items():
+                features = map.features[name]
+                check_count(image, len(features))
+                writer.write(name, features)
         if map.matches:
             counts = {name: image.num_points2D() for name, image in map.images.items()}
             write_matches(partial / "matches.h5", map.matches, counts)

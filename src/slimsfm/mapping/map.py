@@ -75,6 +75,10 @@ class Map:
         found = [self.model.image(image_id) for image_id in self.model.reg_image_ids()]
         return {image.name: image for image in sorted(found, key=lambda image: image.name)}
 
+    def camera(self, name: str) -> pycolmap.Camera:
+        """The camera of a reference image."""
+        return self.model.camera(self.images[name].camera_id)
+
     @cached_property
     def point3D_ids(self) -> Ids:
         """Ids of the points, ascending: the order of every array of points."""
@@ -114,16 +118,24 @@ def check_map(map: Map) -> None:
     """Make sure that a map's parts fit each other.
 
     Raises:
-        MapError: There is no reference image or point, or an image's features are missing or of another
-            number than its keypoints.
+        MapError: There is no reference image or point, or an image's features are missing.
     """
     if not map.images or not len(map.point3D_ids):
         raise MapError(
             f"the map has {len(map.images)} images and {len(map.point3D_ids)} points; it needs both"
         )
-    for name, image in map.images.items():
+    for name in map.images:
         if name not in map.features:
             raise MapError(f"the map has no features of its image {name!r}")
-        rows = map.observations[name].rows
-        if len(rows) and rows[-1] >= image.num_points2D():
-            raise MapError(f"an observation in image {name!r} points at a keypoint that is not there")
+
+
+def check_count(image: pycolmap.Image, count: int) -> None:
+    """Make sure that an image has as many features as keypoints in the model.
+
+    Raises:
+        MapError: It has not.
+    """
+    if count != image.num_points2D():
+        raise MapError(
+            f"image {image.name!r} has {image.num_points2D()} keypoints in the model but {count} in the features"
+        )

@@ -8,12 +8,14 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from slimsfm.errors import ModelError
 
 _CAMERA, _POSE, _POINT2D = 24, 56, 24  # bytes: id, model, width, height; quaternion and translation; x, y, id
 _TRACK_ELEMENT, _SENSOR, _DATA = 8, 8, 16
+_MOST_PIXELS = 1_000_000  # along a side
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
@@ -40,7 +42,48 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         raise ModelError(f"{path}: pycolmap cannot read this model: {_first_line(error)}") from error
     if not model.num_reg_images():
         raise ModelError(f"{path}: the model has no image with a pose")
+    fault = _fault(model)
+    if fault:
+        raise ModelError(f"{path}: {fault}; copy or export the model again")
     return model
+
+
+def _fault(model: pycolmap.Reconstruction) -> str | None:
+    """What is wrong with a model that pycolmap could read, if anything is."""
+    for camera_id, camera in sorted(model.cameras.items()):
+        if camera.is_spherical():
+            return f"camera {camera_id} is spherical ({camera.model_name}), which nothing here can use"
+        if not _is_camera(camera):
+            return f"camera {camera_id} has a size or focal length that no camera has"
+    if not model.is_valid() or _num_track_elements(model) != model.compute_num_observations():
+        return "its points and images do not refer to each other"
+    if len({image.name for image in model.images.values()}) < model.num_images():
+        return "several of its images have the same name"
+    poses = [model.image(image_id).cam_from_world().matrix() for image_id in model.reg_image_ids()]
+    positions = np.array([point.xyz for point in model.points3D.values()])
+    if not np.isfinite(poses).all() or not np.isfinite(positions).all():
+        return "a pose or a point in it is not finite"
+    return None
+
+
+def _is_camera(camera: pycolmap.Camera) -> bool:
+    sizes_are_possible = 0 < camera.width < _MOST_PIXELS and 0 < camera.height < _MOST_PIXELS
+    return sizes_are_possible and np.isfinite(camera.params).all() and camera.mean_focal_length() > 0
+
+
+def _num_track_elements(model: pycolmap.Reconstruction) -> int:
+    return sum(point.track.length() for point in model.points3D.values())
+
+
+def camera_of(image: pycolmap.Image) -> pycolmap.Camera:
+    """The camera of an image of a model.
+
+    Raises:
+        ModelError: The model does not have it.
+    """
+    if image.camera is None:
+        raise ModelError(f"image {image.name!r} has no camera in the model")
+    return image.camera
 
 
 def _first_line(error: Exception) -> str:

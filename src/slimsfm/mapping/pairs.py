@@ -39,7 +39,7 @@ def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[
     share = max(1, _WORD_SAMPLES // len(names))
     generator = np.random.default_rng(seed)
     samples = [unit_rows(generator.permutation(features[name].descriptors, axis=0)[:share]) for name in names]
-    words = kmeans2(np.concatenate(samples), _WORDS, minit="++", seed=seed)[0].astype(np.float32)
+    words = kmeans2(np.concatenate(samples), _WORDS, minit="++", rng=seed)[0].astype(np.float32)
     return np.stack([vlad(unit_rows(features[name].descriptors), words) for name in names])
 
 
@@ -70,7 +70,7 @@ def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", name)
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
 def vlad(descriptors: Descriptors, words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 import pycolmap
 from jaxtyping import Float64, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from slimsfm.arrays import GrayImage
 from slimsfm.errors import ImageError, ModelError
 from slimsfm.features import Features
 from slimsfm.features.sift import Sift, root_sift
+from slimsfm.mapping.model import camera_of
 from slimsfm.photos import read_image
 from slimsfm.progress import ProgressBar
 
@@ -52,10 +53,11 @@ def redescribe(
 def _redescribe_image(image: pycolmap.Image, path: Path, extractor: Sift) -> Features:
     pixels = read_image(path)
     height, width = pixels.shape[:2]
-    if (width, height) != (image.camera.width, image.camera.height):
+    camera = camera_of(image)
+    if (width, height) != (camera.width, camera.height):
         raise ImageError(
             f"{path}: {width}x{height} pixels, but its camera in the model has "
-            f"{image.camera.width}x{image.camera.height}; give the images that the model was made of"
+            f"{camera.width}x{camera.height}; give the images that the model was made of"
         )
     keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -70,7 +72,7 @@ def _redescribe_image(image: pycolmap.Image, path: Path, extractor: Sift) -> Fea
 def _describe(
     gray: GrayImage, keypoints: Float64[np.ndarray, "n 2"], extractor: Sift
 ) -> UInt8[np.ndarray, "n 128"]:
-    detector = cv2.SIFT_create(
+    detector = cv2.SIFT.create(
         0, contrastThreshold=extractor.contrast_threshold / 2, enable_precise_upscale=True
     )
     descriptors = np.zeros((len(keypoints), 128), np.uint8)
@@ -78,7 +80,7 @@ def _describe(
     if not detected or not len(keypoints):
         return descriptors
     pixels = np.array([one.pt for one in detected]) + 0.5
-    distances, nearest = cKDTree(pixels).query(keypoints)
+    distances, nearest = KDTree(pixels).query(keypoints)
     rows = np.flatnonzero(distances < _REACH_PX)
     wanted = []
     for row in rows:

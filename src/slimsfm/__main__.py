@@ -1,0 +1,5 @@
+"""`python -m slimsfm`."""
+
+from slimsfm.cli import main
+
+main()
