@@ -6,7 +6,8 @@
     │   ├── ModelError      ... because a COLMAP model is damaged or lacks something
     │   └── MapError        ... because a map is damaged, incomplete or of a later format
     ├── OutputError         a result cannot be written where the user asked
-    └── ReconstructionError Structure from Motion found no model in the images
+    ├── ReconstructionError Structure from Motion found no model in the images
+    └── WorkError           work given to other processes or machines failed again and again
 
 A bad value in Python code is a plain `ValueError` that names the argument. An image that cannot be localized
 is no error: its pose is None.
@@ -39,3 +40,7 @@ class OutputError(SlimsfmError):
 
 class ReconstructionError(SlimsfmError):
     """Structure from Motion found no model in the images."""
+
+
+class WorkError(SlimsfmError):
+    """Work given to other processes or machines failed again and again."""

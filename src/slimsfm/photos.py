@@ -1,5 +1,7 @@
 """Image files: which there are, their upright pixels, and the camera that their EXIF data tells of."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +46,17 @@ def read_image(path: Path) -> Image:
     Raises:
         ImageError: The file is missing or is no complete image.
     """
+    with _reading(path), PillowImage.open(path) as file:
+        upright = ImageOps.exif_transpose(file)
+        if upright.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8, not scale them
+            upright = PillowImage.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
+        return np.array(upright.convert("RGB"))
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
     try:
-        with PillowImage.open(path) as file:
-            return np.array(ImageOps.exif_transpose(file).convert("RGB"))
+        yield
     except FileNotFoundError as error:
         raise ImageError(f"{path}: no such image") from error
     except _UNREADABLE as error:
@@ -72,13 +82,10 @@ def camera_from_exif(path: Path) -> pycolmap.Camera:
     Raises:
         ImageError: The file is no image.
     """
-    try:
+    with _reading(path), PillowImage.open(path) as file:
+        turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
+        upright_size = file.size[::-1] if turned else file.size
         camera = pycolmap.infer_camera_from_image(path)
-        with PillowImage.open(path) as file:
-            turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
-            upright_size = file.size[::-1] if turned else file.size
-    except _UNREADABLE as error:
-        raise ImageError(f"{path}: not a readable image; remove or replace it") from error
     guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
     guess.has_prior_focal_length = camera.has_prior_focal_length
     return guess

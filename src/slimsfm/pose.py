@@ -9,6 +9,7 @@ import pycolmap
 from slimsfm.arrays import Mask, Points2D, Points3D
 
 _MINIMAL = 3  # matches that P3P needs
+_MIN_ITERATIONS = 100  # hypotheses; a low share of inliers asks for more by itself
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +136,7 @@ def _poselib_options(options: RansacOptions) -> tuple[dict, dict]:
     ransac = {
         "max_reproj_error": options.max_error_px,
         "max_iterations": options.max_iterations,
-        "min_iterations": min(1000, options.max_iterations),
+        "min_iterations": min(_MIN_ITERATIONS, options.max_iterations),
         "seed": options.seed,
     }
     return ransac, {"loss_type": "CAUCHY"}

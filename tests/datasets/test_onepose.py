@@ -69,8 +69,8 @@ def test_files_follow_the_published_conventions(tmp_path):
 
 
 DAMAGES = {
-    "no box": ("box3d_corners.txt", None, "cannot be read"),
-    "seven corners": ("box3d_corners.txt", "0 0 0\n" * 7, "8 rows of 3"),
+    "no box": ("box3d_corners.txt", None, "no such box file"),
+    "seven corners": ("box3d_corners.txt", "0 0 0\n" * 7, "8 points"),
     "flat box": ("box3d_corners.txt", "0 0 0\n" * 8, "half_edges"),
     "no intrinsics": ("cup-1/intrinsics.txt", None, "cannot be read"),
     "no cy": ("cup-1/intrinsics.txt", "fx: 1\nfy: 1\ncx: 1\n", "must have the lines"),

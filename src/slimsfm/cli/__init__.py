@@ -3,6 +3,7 @@
 import signal
 import sys
 from importlib import import_module
+from threading import current_thread, main_thread
 from types import FrameType
 
 COMMANDS = {
@@ -48,12 +49,15 @@ def run(arguments: list[str]) -> int:
         return 0
     if name not in COMMANDS:
         return _fail(f"{name!r} is no command; there are {', '.join(COMMANDS)}")
-    from slimsfm.cli.output import quiet
     from slimsfm.errors import SlimsfmError
 
     try:
+        from slimsfm.cli.output import quiet
+
+        command = import_module(f"slimsfm.cli.{name}_command")
+        _take_signal_back()
         with quiet():
-            import_module(f"slimsfm.cli.{name}_command").main(rest)
+            command.main(rest)
     except SlimsfmError as error:
         return _fail(str(error))
     except SystemExit as end:  # --help
@@ -67,6 +71,13 @@ def run(arguments: list[str]) -> int:
 def _fail(message: str) -> int:
     print(f"slimsfm: {message}", file=sys.stderr)
     return 2
+
+
+def _take_signal_back() -> None:
+    """Importing pycolmap makes SIGTERM end the process on the spot: put back what Python had for it."""
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and current_thread() is main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _interrupt(_signum: int, _frame: FrameType | None) -> None:

@@ -41,6 +41,7 @@ def benchmark_images(
         keep_maps: Keep the maps that are compared in this folder.
     """
     watch = Stopwatch()
+    query_names(list_images(images), query_every)  # refused before the long work, not after
     truth = _ground_truth(images, output / "pseudo-ground-truth", build)
     names = query_names(list(truth.images), query_every)
     references = hold_out(truth, names)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from functools import partial, wraps
 from io import StringIO
-from itertools import takewhile
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, TypeVar
@@ -62,10 +61,10 @@ def parse(command: Callable[..., Result], arguments: Sequence[str]) -> Result:
 
 
 def _in_one_line(boxed: str) -> str:
-    """What stands in tyro's box above its first rule, without the name that our functions give to options."""
-    lines = [line.strip("│ ") for line in boxed.splitlines() if line.startswith("│")]
-    message = " ".join(takewhile(lambda line: not line.startswith("─"), lines))
-    return re.sub(r"^Error parsing [a-z][\w.]*: ", "", message) or boxed
+    """What stands in tyro's box below its title, without the name that our functions give to options."""
+    parts = re.split(r".*(?:─{4}|-{4}).*\n", boxed)
+    message = " ".join(line.strip("│ ") for line in parts[min(1, len(parts) - 1)].splitlines())
+    return re.sub(r"^Error parsing [a-z][\w.]*: ", "", message.strip().rstrip("."))
 
 
 def check_output(output: Path, source: Path, *, overwrite: bool) -> None:
@@ -109,7 +108,7 @@ def counts(map: Map) -> dict[str, int]:
     }
 
 
-def size(num_bytes: float) -> str:
+def size(num_bytes: float | int) -> str:
     """Bytes for a human reader."""
     for unit in ("B", "kB", "MB"):
         if num_bytes < 1000:

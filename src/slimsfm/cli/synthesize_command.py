@@ -1,5 +1,6 @@
 """`slimsfm synthesize`."""
 
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -35,8 +36,11 @@ def synthesize_objects(
 
 @contextmanager
 def all_cores() -> Iterator[Executor]:
-    """A process for each core, each started afresh."""
-    with ProcessPoolExecutor(len(sched_getaffinity(0)), mp_context=get_context("spawn")) as executor:
+    """A process for each core, each started afresh; Ctrl-C is for this one to handle."""
+    ignore = (signal.SIGINT, signal.SIG_IGN)
+    with ProcessPoolExecutor(
+        len(sched_getaffinity(0)), get_context("spawn"), initializer=signal.signal, initargs=ignore
+    ) as executor:
         try:
             yield executor
         except BaseException:

@@ -56,7 +56,7 @@ def add_percent(errors: Sequence[PoseError], fraction: float) -> float:
     return 100 * float(np.mean([error.relative_corner_error < fraction for error in errors]))
 
 
-def deg_cm_percent(errors: Sequence[PoseError], n: float) -> float:
+def deg_cm_percent(errors: Sequence[PoseError], n: int) -> float:
     """Percentage of poses within n degrees and n cm; the map's unit must be the metre."""
     return 100 * float(
         np.mean([error.rotation_deg <= n and 100 * error.translation <= n for error in errors])

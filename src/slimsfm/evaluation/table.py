@@ -22,13 +22,13 @@ class Row:
     variant: str
     """Which map: "full", "dominating" or "random"."""
 
-    references: float
+    references: float | int
     """Reference images of the map; a mean where the variant is one of several draws."""
 
-    points: float
+    points: float | int
     """Points of the map, likewise."""
 
-    map_bytes: float
+    map_bytes: float | int
     """Size of the map on disk, likewise."""
 
     scores: Scores
@@ -90,5 +90,5 @@ def mean_row(rows: Sequence[Row]) -> Row:
     )
 
 
-def _mean(values: Sequence[float]) -> float:
+def _mean(values: Sequence[float | int]) -> float:
     return float(np.mean(values))

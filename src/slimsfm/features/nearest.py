@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import IndexPairs
-
 _BLOCK = 256  # rows
 
 
@@ -31,7 +29,7 @@ def match_nearest(
     descriptors1: Float32[np.ndarray, "n d"],
     descriptors2: Float32[np.ndarray, "m d"],
     options: NearestOptions = NearestOptions(),
-) -> IndexPairs:
+) -> Int64[np.ndarray, "k 2"]:
     """Match two sets of descriptors of unit length, as COLMAP does: mutual nearest, ratio test on angles.
 
     Each row of either set is matched at most once. The ratio test applies on the side of `descriptors1`.

@@ -81,7 +81,7 @@ def root_sift(descriptors: Float32[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n
     return np.clip(np.round(512 * np.sqrt(descriptors / sums)), 0, 255).astype(np.uint8)
 
 
-def _shrink(image: GrayImage, scale: float) -> GrayImage:
+def _shrink(image: GrayImage, scale: float) -> UInt8[np.ndarray, "h w"]:
     if scale == 1.0:
         return image
     height, width = image.shape

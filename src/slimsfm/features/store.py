@@ -9,7 +9,10 @@ converts.
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from io import FileIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -17,6 +20,9 @@ import numpy as np
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features.base import Features
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 _PIXEL_CENTER = np.float32(0.5)
 _INT16_MAX = np.iinfo(np.int16).max
@@ -39,12 +45,12 @@ class FeatureFile(Mapping[str, Features]):
             raise KeyError(name)
         try:
             return _read_features(self._file, name)
-        except (KeyError, OSError, TypeError, ValueError) as error:
+        except (LookupError, OSError, TypeError, ValueError) as error:
             raise InputError(f"{self._path}: the features of {name!r} are damaged ({error})") from error
 
     def count(self, name: str) -> int:
         """How many features an image has, without reading them."""
-        keypoints = self._file[name]["keypoints"]
+        keypoints = self._file[f"{name}/keypoints"]
         return keypoints.shape[0] if isinstance(keypoints, h5py.Dataset) and keypoints.shape else 0
 
     def __iter__(self) -> Iterator[str]:
@@ -117,13 +123,14 @@ class FeatureWriter:
     """Writes features image by image, so that never all of them are in memory."""
 
     def __init__(self, path: Path) -> None:
-        self._file = h5py.File(path, "w", libver="latest")
+        self._closing = ExitStack()
+        self._file = self._closing.enter_context(_create(path))
 
     def __enter__(self) -> "FeatureWriter":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        self._closing.close()
 
     def write(self, name: str, features: Features) -> None:
         """Add the features of one image."""
@@ -138,7 +145,7 @@ def write_matches(
     path: Path, matches: Mapping[tuple[str, str], IndexPairs], num_keypoints: Mapping[str, int]
 ) -> None:
     """Write verified matches, in sorted order of the pairs."""
-    with h5py.File(path, "w", libver="latest") as file:
+    with _create(path) as file:
         for a, b in sorted(matches):
             pairs = matches[a, b]
             kind = np.int16 if num_keypoints[b] <= _INT16_MAX else np.int32
@@ -148,6 +155,32 @@ def write_matches(
             group.create_dataset("matches0", data=targets, compression="gzip", shuffle=True)
             scores = (targets >= 0).astype(np.float16)
             group.create_dataset("matching_scores0", data=scores, compression="gzip", shuffle=True)
+
+
+@contextmanager
+def _create(path: Path) -> Iterator[h5py.File]:
+    path.unlink(missing_ok=True)  # who still reads an older file keeps it
+    with _PatientFile(path, "w+b") as raw:
+        with h5py.File(raw, "w", libver="latest") as file:
+            yield file
+        if raw.failure:
+            raise raw.failure
+
+
+class _PatientFile(FileIO):
+    """Remembers that it could not be written: told that the disk is full, HDF5 crashes the process."""
+
+    failure: OSError | None = None
+
+    def write(self, data: "ReadableBuffer", /) -> int:
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while rest and not self.failure:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.failure = error
+        return size
 
 
 def _open(path: Path) -> h5py.File:

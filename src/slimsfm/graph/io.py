@@ -22,7 +22,7 @@ def graph_key(map: Map, options: GraphOptions) -> str:
     for name, image in map.images.items():
         digest.update(name.encode())
         digest.update(image.cam_from_world().matrix().tobytes())
-        digest.update(image.camera.model_name.encode() + image.camera.params.tobytes())
+        digest.update(map.camera(name).model_name.encode() + map.camera(name).params.tobytes())
         digest.update(map.observations[name].rows.tobytes())
         digest.update(map.observations[name].points.tobytes())
     return digest.hexdigest()
@@ -37,7 +37,7 @@ def write_graph(path: Path, graph: ReferenceGraph, key: str) -> None:
 def read_graph(path: Path, key: str) -> ReferenceGraph | None:
     """Read a graph; None where there is none, or one of another map or other options."""
     try:
-        with np.load(path) as stored:
+        with path.open("rb") as file, np.load(file) as stored:
             if str(stored["key"]) != key:
                 return None
             return ReferenceGraph(names=tuple(stored["names"].tolist()), errors=stored["errors"])

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
+from jaxtyping import Int64
 
-from slimsfm.arrays import Descriptors, Ids, Points2D
+from slimsfm.arrays import Descriptors, Points2D
 from slimsfm.features import NearestOptions, match_nearest, unit_rows
 from slimsfm.geometry import corner_error
 from slimsfm.graph.reference_graph import ReferenceGraph
@@ -35,8 +36,8 @@ class _Reference:
 
     keypoints: Points2D
     descriptors: Descriptors
-    rows: Ids  # of those keypoints that see a point
-    points: Ids  # rows of these points
+    rows: Int64[np.ndarray, " k"]  # of those keypoints that see a point
+    points: Int64[np.ndarray, " k"]  # rows of these points
     camera: pycolmap.Camera
     cam_from_world: pycolmap.Rigid3d
 

@@ -27,7 +27,7 @@ def read_camera(path: Path) -> pycolmap.Camera:
         (camera,) = cameras
         camera_id, model, width, height, *params = camera
         read = pycolmap.Camera.create_from_model_name(int(camera_id), model, 1.0, int(width), int(height))
-        read.params = np.array([float(p) for p in params])
+        read.params = [float(p) for p in params]
         if _is_usable(read):
             return read
         raise ValueError("not this model's parameters")

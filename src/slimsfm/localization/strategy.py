@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Int64
 
-from slimsfm.arrays import Descriptors, Ids, IndexPairs
+from slimsfm.arrays import Descriptors, Ids
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,7 +32,7 @@ class Strategy(Protocol):
         ...
 
 
-def unite(parts: list[IndexPairs]) -> PointMatches:
+def unite(parts: list[Int64[np.ndarray, "_ 2"]]) -> PointMatches:
     """Join pairs (keypoint, point) from several sources; equal pairs become one. Sorted by keypoint, point."""
     pairs = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *parts]), axis=0)
     return PointMatches(keypoints=pairs[:, 0], points=pairs[:, 1])

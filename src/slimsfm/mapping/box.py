@@ -28,7 +28,8 @@ def read_box(path: Path) -> Box:
             data = json.loads(path.read_text())
             corners = np.array(data["corners"] if isinstance(data, dict) else data, np.float64)
         else:
-            corners = np.array([line.split() for line in path.read_text().splitlines()], np.float64)
+            lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+            corners = np.array(lines, np.float64)
         return Box.from_corners(corners)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such box file") from error
@@ -41,9 +42,9 @@ def read_box(path: Path) -> Box:
 def estimate_box(model: pycolmap.Reconstruction) -> Box:
     """Estimate the box of what the images look at.
 
-    A point counts by how often, and how near the middle of an image, it is seen. What is farther from the mean
-    than twice the root mean square distance is background and trimmed, until nothing changes. The box is
-    aligned with the principal axes of what remains and holds all but 1 % of the count at each of its six sides.
+    A point counts by how often, and how near the middle of an image, it is seen. What is farther from the
+    mean than twice the root mean square distance is background and trimmed, until nothing changes. The box is
+    aligned with the principal axes of what remains and holds all but 1 % of the count at each of its sides.
 
     Where masks were used, features and so points lie on the object alone, and the same rule holds.
     """

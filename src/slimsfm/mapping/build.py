@@ -119,7 +119,7 @@ def build_map(
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
     )
-    matches = verified_matches(database, dict(enumerate(names, start=1)))
+    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     return _build(Map(model=model, features=features, matches=matches, info=info), names)
 
 

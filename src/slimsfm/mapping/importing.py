@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from jaxtyping import Int64
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
@@ -120,6 +121,15 @@ def _from_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
         header = file.read(16)
     if header != b"SQLite format 3\0":
         raise InputError(f"{path}: not a COLMAP database")
+    try:
+        return _read_database(model, path)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"{path}: not readable as a COLMAP database, which must be whole and writable ({error})"
+        ) from error
+
+
+def _read_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
     with pycolmap.Database.open(path) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         extractors = set()
@@ -171,6 +181,7 @@ def _from_hloc(model: pycolmap.Reconstruction, options: ImportOptions) -> _Sourc
     matches = {}
     if options.matches:
         raw = MatchFile(options.matches, sorted(features))
+        _check_matches(options.matches, raw, features)
         matches = _consistent_matches(model, features, raw)
     return _Source(
         features=features,
@@ -181,12 +192,17 @@ def _from_hloc(model: pycolmap.Reconstruction, options: ImportOptions) -> _Sourc
     )
 
 
+def _check_matches(path: Path, matches: MatchFile, features: Mapping[str, Features]) -> None:
+    for a, b in matches:
+        limits = (len(features[a]), len(features[b]))
+        if np.any(matches[a, b] >= limits):
+            raise ModelError(f"{path}: the matches of {a!r} and {b!r} name a keypoint that is not there")
+
+
 def _consistent_matches(
-    model: pycolmap.Reconstruction,
-    features: Mapping[str, Features],
-    raw: Mapping[tuple[str, str], IndexPairs],
-) -> dict[tuple[str, str], IndexPairs]:
-    """hloc's matches are not verified: keep those that fit the epipolar geometry of the model's poses."""
+    model: pycolmap.Reconstruction, features: Mapping[str, Features], raw: MatchFile
+) -> dict[tuple[str, str], Int64[np.ndarray, "kept 2"]]:
+    """Those of hloc's unverified matches that fit the epipolar geometry of the model's poses."""
     images = {image.name: image for image in _posed_images(model)}
     cameras = {name: camera_of(image) for name, image in images.items()}
     verified = {}

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
@@ -34,7 +35,7 @@ def read_map(path: Path) -> Map:
         model = read_model(path / "sparse")
         features = FeatureFile(path / "features.h5")
         matches = path / "matches.h5"
-        names = sorted(image.name for image in model.images.values())
+        names = sorted(model.image(i).name for i in model.reg_image_ids())
         map_ = Map(
             model=model,
             features=features,
@@ -85,10 +86,18 @@ def _info_to_json(info: MapInfo) -> dict:
     return {
         "format_version": FORMAT_VERSION,
         "extractor": {"name": info.extractor, "options": info.extractor_options},
-        "box": {"corners": info.box.corners.tolist(), "source": info.box_source},
+        "box": {
+            "center": info.box.center.tolist(),
+            "half_edges": info.box.half_edges.tolist(),
+            "source": info.box_source,
+        },
         "unit": info.unit,
         "origin": info.origin,
     }
+
+
+def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
+    return np.array(values, np.float64).reshape(shape)
 
 
 def _read_info(path: Path) -> MapInfo:
@@ -104,7 +113,7 @@ def _read_info(path: Path) -> MapInfo:
         return MapInfo(
             extractor=data["extractor"]["name"],
             extractor_options=data["extractor"]["options"],
-            box=Box.from_corners(np.array(data["box"]["corners"], np.float64)),
+            box=Box(_numbers(data["box"]["center"], 3), _numbers(data["box"]["half_edges"], 3, 3)),
             box_source=data["box"]["source"],
             unit=data["unit"],
             origin=data["origin"],

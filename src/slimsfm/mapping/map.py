@@ -137,5 +137,6 @@ def check_count(image: pycolmap.Image, count: int) -> None:
     """
     if count != image.num_points2D():
         raise MapError(
-            f"image {image.name!r} has {image.num_points2D()} keypoints in the model but {count} in the features"
+            f"image {image.name!r} has {image.num_points2D()} keypoints in the model "
+            f"but {count} in the features"
         )

@@ -1,7 +1,8 @@
 """Reading COLMAP models, checked beforehand.
 
-pycolmap trusts the counts in a binary file: one that is cut short makes it run out of memory or abort the whole
-process. So each binary file is walked first, record by record, as COLMAP's "Output Format" describes it.
+pycolmap trusts the counts in a binary file: one that is cut short makes it run out of memory or abort the
+whole process. So each binary file is walked first, record by record, as COLMAP's "Output Format" describes.
+Some damage it does not notice at all; that is looked for in the model it gives.
 """
 
 import struct
@@ -38,21 +39,33 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     try:
         model = pycolmap.Reconstruction()
         (model.read_binary if suffix == ".bin" else model.read_text)(path)
+        if suffix == ".txt":
+            _name_images(model, path / "images.txt")
+        fault = _fault(model)
     except (RuntimeError, ValueError, IndexError) as error:
         raise ModelError(f"{path}: pycolmap cannot read this model: {_first_line(error)}") from error
-    if not model.num_reg_images():
-        raise ModelError(f"{path}: the model has no image with a pose")
-    fault = _fault(model)
     if fault:
-        raise ModelError(f"{path}: {fault}; copy or export the model again")
+        raise ModelError(f"{path}: {fault}; export the model again")
     return model
+
+
+def _name_images(model: pycolmap.Reconstruction, file: Path) -> None:
+    """Give images their whole names, of which pycolmap reads from text no more than the first word."""
+    lines = iter(file.read_text().split("\n"))
+    for line in lines:
+        if line.strip() and not line.strip().startswith("#"):
+            words = line.split(maxsplit=9)
+            model.image(int(words[0])).name = words[9].strip()
+            next(lines, None)  # its keypoints
 
 
 def _fault(model: pycolmap.Reconstruction) -> str | None:
     """What is wrong with a model that pycolmap could read, if anything is."""
+    if not model.num_reg_images():
+        return "the model has no image with a pose"
     for camera_id, camera in sorted(model.cameras.items()):
         if camera.is_spherical():
-            return f"camera {camera_id} is spherical ({camera.model_name}), which nothing here can use"
+            return f"camera {camera_id} is spherical ({camera.model_name}), not one with a lens"
         if not _is_camera(camera):
             return f"camera {camera_id} has a size or focal length that no camera has"
     if not model.is_valid() or _num_track_elements(model) != model.compute_num_observations():
@@ -68,7 +81,8 @@ def _fault(model: pycolmap.Reconstruction) -> str | None:
 
 def _is_camera(camera: pycolmap.Camera) -> bool:
     sizes_are_possible = 0 < camera.width < _MOST_PIXELS and 0 < camera.height < _MOST_PIXELS
-    return sizes_are_possible and np.isfinite(camera.params).all() and camera.mean_focal_length() > 0
+    focal_lengths = camera.params[camera.focal_length_idxs()]
+    return sizes_are_possible and bool(np.isfinite(camera.params).all() and (focal_lengths > 0).all())
 
 
 def _num_track_elements(model: pycolmap.Reconstruction) -> int:

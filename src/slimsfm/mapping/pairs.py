@@ -39,8 +39,14 @@ def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[
     share = max(1, _WORD_SAMPLES // len(names))
     generator = np.random.default_rng(seed)
     samples = [unit_rows(generator.permutation(features[name].descriptors, axis=0)[:share]) for name in names]
-    words = kmeans2(np.concatenate(samples), _WORDS, minit="++", rng=seed)[0].astype(np.float32)
+    words = _vocabulary(np.unique(np.concatenate(samples), axis=0), seed)
     return np.stack([vlad(unit_rows(features[name].descriptors), words) for name in names])
+
+
+def _vocabulary(samples: Descriptors, seed: int) -> Float32[np.ndarray, "k d"]:
+    if len(samples) <= _WORDS:
+        return samples if len(samples) else np.zeros((1, samples.shape[1]), np.float32)
+    return kmeans2(samples, _WORDS, minit="++", rng=seed)[0].astype(np.float32)
 
 
 def exhaustive_pairs(names: Iterable[str]) -> Pairs:

@@ -44,8 +44,8 @@ def redescribe(
         described += int(one.descriptors[seen].any(axis=1).sum())
     if described < _MIN_DESCRIBED * observations:
         raise ModelError(
-            f"{folder}: SIFT features lie at only {described} of the {observations} keypoints that see a point; "
-            "are these the images of the model? Else give its own features with --features or --database"
+            f"{folder}: SIFT features lie at only {described} of the {observations} keypoints that see a "
+            "point; are these the model's images? Else give its own features with --features or --database"
         )
     return features, extractor
 
@@ -80,7 +80,8 @@ def _describe(
     if not detected or not len(keypoints):
         return descriptors
     pixels = np.array([one.pt for one in detected]) + 0.5
-    distances, nearest = KDTree(pixels).query(keypoints)
+    distances, rows_nearest = KDTree(pixels).query(keypoints)
+    nearest = np.asarray(rows_nearest)
     rows = np.flatnonzero(distances < _REACH_PX)
     wanted = []
     for row in rows:

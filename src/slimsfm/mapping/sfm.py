@@ -19,11 +19,12 @@ _BLOCK = 200  # pairs matched between two steps of the progress bar
 def write_database(
     path: Path, features: Mapping[str, Features], cameras: Mapping[str, pycolmap.Camera]
 ) -> None:
-    """Write images, cameras and features as a COLMAP database.
+    """Write images, cameras and features as a COLMAP database, in place of one that may be there.
 
     Cameras with equal `camera_id` are one camera. Image ids count from 1 in order of names; in the database
     they also stand for the names, for COLMAP's lists of pairs cannot hold a name with a space.
     """
+    path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for camera_id, camera in sorted({c.camera_id: c for c in cameras.values()}.items()):
             database.write_camera(camera, use_camera_id=True)
@@ -94,8 +95,8 @@ def verified_matches(database: Path, names: Mapping[int, str]) -> dict[tuple[str
 def reconstruct(database: Path, names: list[str], workspace: Path, *, seed: int) -> pycolmap.Reconstruction:
     """Reconstruct the largest model there is of the images of a database.
 
-    Incremental mapping [1]; where it leaves out more than a tenth of the images (a walk along a street gives it
-    no good pair to start from), global mapping [2] is tried as well and the larger model taken.
+    Incremental mapping [1]; where it leaves out more than a tenth of the images (a walk along a street gives
+    it no good pair to start from), global mapping [2] is tried as well and the larger model taken.
 
     Raises:
         ReconstructionError: No two images could be joined to a model.

@@ -1,0 +1,34 @@
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from commands import Outcome, slimsfm
+from rendered import Rendered, rendered
+
+
+@pytest.fixture(scope="session")
+def boulder(tmp_path_factory) -> Rendered:
+    return rendered(tmp_path_factory.getbasetemp() / "rendered")
+
+
+@dataclass(frozen=True)
+class Reduced:
+    path: Path
+    graph: Path
+    outcome: Outcome
+
+
+@pytest.fixture(scope="session")
+def reduced(boulder, tmp_path_factory) -> Reduced:
+    """The rendered object's map, made slim by the command; the map's graph is kept beside it."""
+    path = tmp_path_factory.mktemp("reduced") / "slim"
+    outcome = slimsfm("reduce", boulder.map_path, "-o", path)
+    return Reduced(path, boulder.map_path / "graph.npz", outcome)
+
+
+@pytest.fixture
+def a_map(boulder, tmp_path) -> Path:
+    """A copy of the rendered object's map, which a test may damage."""
+    return Path(shutil.copytree(boulder.map_path, tmp_path / "map"))

@@ -1,0 +1,215 @@
+"""The whole path through the command line, on one small rendered object."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from commands import contents, slimsfm
+from rendered import MAPPING_FRAMES, NAME, QUERY_FRAMES
+from slimsfm.cli import COMMANDS
+from slimsfm.domination import dominates
+from slimsfm.geometry import corner_error
+from slimsfm.graph.io import graph_of
+from slimsfm.mapping.io import read_map
+
+
+def assert_done(outcome, made, next_command):
+    """A command ends with what it made, in which time, and with what to do next."""
+    assert (outcome.code, outcome.err.strip()) == (0, "")
+    *_, last, next_line = outcome.out.splitlines()
+    assert last.startswith(str(made))
+    assert last.endswith(" s")
+    assert next_line.startswith(f"next: slimsfm {next_command} ")
+
+
+def poses_of(path):
+    images = json.loads(path.read_text())["images"]
+    return {
+        image["name"]: pycolmap.Rigid3d(
+            pycolmap.Rotation3d(np.array(image["cam_from_world"]["quaternion_xyzw"])),
+            np.array(image["cam_from_world"]["translation"]),
+        )
+        for image in images
+        if image["localized"]
+    }
+
+
+def test_synthesize(boulder):
+    assert_done(boulder.synthesize, boulder.folder / "objects", "build")
+    assert f"1 objects, {MAPPING_FRAMES + QUERY_FRAMES} frames" in boulder.synthesize.out
+    assert len(list(boulder.photos.iterdir())) == MAPPING_FRAMES
+    assert len(list(boulder.queries.iterdir())) == QUERY_FRAMES
+    assert sorted(path.name for path in (boulder.folder / "objects").iterdir()) == [NAME]
+
+
+def test_build_and_info(boulder, tmp_path):
+    built = slimsfm("build", boulder.photos, "-o", tmp_path / "map")
+    assert_done(built, tmp_path / "map", "reduce")
+    facts = json.loads(slimsfm("info", tmp_path / "map", "--json").out)
+    map_ = read_map(tmp_path / "map")
+    assert facts["images"] == list(map_.images)
+    assert len(facts["images"]) > MAPPING_FRAMES / 2
+    assert facts["points"] == len(map_.point3D_ids)
+    assert facts["observations"] == map_.model.compute_num_observations()
+    assert facts["box"]["source"] == "estimated"
+    assert facts["unit"] == "unknown"
+    assert facts["extractor"]["name"] == "sift"
+    assert facts["verified_pairs"] == len(map_.matches) > 0
+    sizes = {name: size for name, size in facts["bytes"].items() if name != "total"}
+    assert facts["bytes"]["total"] == sum(sizes.values()) > 0
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]
+    told = slimsfm("info", tmp_path / "map", "--images").out
+    assert all(name in told for name in facts["images"])
+    assert facts["images"][0] not in slimsfm("info", tmp_path / "map").out
+
+
+def test_reduce_keeps_a_dominating_set(boulder, reduced):
+    assert_done(reduced.outcome, reduced.path, "localize")
+    assert "proven smallest" in reduced.outcome.out
+    full, slim = boulder.map, read_map(reduced.path)
+    graph = graph_of(full, reduced.graph, progress=_never)
+    kept = [graph.names.index(name) for name in slim.images]
+    assert dominates(graph.adjacency(), kept)
+    assert 1 <= len(kept) < MAPPING_FRAMES
+    assert f"kept {', '.join(slim.images)}" in reduced.outcome.out
+
+
+def _never(_items, label):
+    raise AssertionError(f"{label}: computed though it was there")
+
+
+def test_another_threshold_reuses_the_graph(reduced, boulder, tmp_path):
+    before = reduced.graph.read_bytes(), reduced.graph.stat().st_mtime_ns
+    loose = slimsfm("reduce", boulder.map_path, "-o", tmp_path / "loose", "--threshold", 0.2)
+    assert loose.code == 0
+    assert (reduced.graph.read_bytes(), reduced.graph.stat().st_mtime_ns) == before
+    assert len(read_map(tmp_path / "loose").images) <= len(read_map(reduced.path).images)
+
+
+def test_equal_reductions_are_equal_bytes(reduced, boulder, tmp_path):
+    slimsfm("reduce", boulder.map_path, "-o", tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(reduced.path)
+
+
+def test_reduce_to_named_and_to_random_images(boulder, tmp_path):
+    named = slimsfm("reduce", boulder.map_path, "-o", tmp_path / "named", "--images", "3.png", "11.png")
+    assert_done(named, tmp_path / "named", "localize")
+    assert list(read_map(tmp_path / "named").images) == ["11.png", "3.png"]
+    drawn = slimsfm("reduce", boulder.map_path, "-o", tmp_path / "drawn", "--random", 5)
+    assert_done(drawn, tmp_path / "drawn", "localize")
+    assert len(read_map(tmp_path / "drawn").images) == 5
+
+
+@pytest.mark.parametrize("strategy", ["exhaustive", "direct"])
+def test_localize_references_in_full_and_slim_map(boulder, reduced, tmp_path, strategy):
+    truth, photos = boulder.map, tmp_path / "photos"
+    photos.mkdir()
+    for path in boulder.mapping.image_paths[::3]:
+        shutil.copy(path, photos)
+    for map_path in (boulder.map_path, reduced.path):
+        output = tmp_path / f"{map_path.name}.json"
+        done = slimsfm("localize", map_path, photos, "-o", output, "--strategy", strategy)
+        assert_done(done, output, "info")
+        found = poses_of(output)
+        errors = [
+            corner_error(pose, truth.images[name].cam_from_world(), truth.box) for name, pose in found.items()
+        ]
+        assert len(found) == MAPPING_FRAMES / 3
+        assert max(errors) < 0.05
+
+
+def test_localize_one_image_with_its_camera(boulder, tmp_path):
+    camera = boulder.mapping.camera
+    line = f"1 {camera.model_name} {camera.width} {camera.height} {' '.join(map(str, camera.params))}\n"
+    (tmp_path / "camera.txt").write_text(line)
+    one, output = boulder.photos / "12.png", tmp_path / "pose.csv"
+    done = slimsfm("localize", boulder.map_path, one, "-o", output, "--camera", tmp_path / "camera.txt")
+    assert_done(done, output, "info")
+    assert "1 of 1 images localized" in done.out
+    assert len(output.read_text().splitlines()) == 2
+
+
+def test_what_shows_nothing_of_the_object_is_not_localized(boulder, tmp_path):
+    folder = tmp_path / "queries"
+    folder.mkdir()
+    Image.new("RGB", (320, 240)).save(folder / "black.png")
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(folder / "noise.png")
+    done = slimsfm("localize", boulder.map_path, folder, "-o", tmp_path / "poses.json")
+    assert_done(done, tmp_path / "poses.json", "info")
+    assert "black.png: not localized" in done.out
+    assert "noise.png: not localized" in done.out
+    assert "0 of 2 images localized" in done.out
+    assert poses_of(tmp_path / "poses.json") == {}
+
+
+def test_import_brings_the_model_back(boulder, tmp_path):
+    arguments = ("--features", boulder.map_path / "features.h5", "--matches", boulder.map_path / "matches.h5")
+    done = slimsfm("import", boulder.map_path / "sparse", "-o", tmp_path / "map", *arguments)
+    assert_done(done, tmp_path / "map", "reduce")
+    assert list(read_map(tmp_path / "map").images) == list(boulder.map.images)
+    assert len(read_map(tmp_path / "map").point3D_ids) == len(boulder.map.point3D_ids)
+
+
+def test_benchmark_of_a_folder_of_photos(boulder, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for path in boulder.mapping.image_paths[8:24]:
+        shutil.copy(path, photos / f"{int(path.stem):02d}.png")
+    output = tmp_path / "results"
+    done = slimsfm("benchmark", "images", photos, "-o", output, "--strategies", "direct", "--query-every", 4)
+    assert_done(done, output / "results.json", "reduce")
+    results = json.loads((output / "results.json").read_text())
+    rows = results["rows"]
+    assert [(row["strategy"], row["variant"]) for row in rows] == [
+        ("direct", variant) for variant in ("full", "dominating", "random")
+    ]
+    truth = read_map(output / "pseudo-ground-truth")
+    queries = sorted(truth.images)[::4]
+    assert {row["queries"] for row in rows} == {len(queries)}
+    about = results["objects"]["photos"]
+    assert about["references"] == rows[0]["references"] == len(truth.images) - len(queries)
+    assert len(about["dominating_set"]) == rows[1]["references"] >= about["lower_bound"]
+    assert not set(about["dominating_set"]) & set(queries)
+    assert results["options"]["strategies"] == ["direct"]
+    before = contents(output / "pseudo-ground-truth")
+    again = slimsfm("benchmark", "images", photos, "-o", output, "--strategies", "direct", "--query-every", 4)
+    assert again.code == 0
+    assert contents(output / "pseudo-ground-truth") == before
+
+
+def test_overwrite_replaces_the_whole_map(boulder, tmp_path):
+    for names in (("3.png", "11.png"), ("5.png",)):
+        done = slimsfm("reduce", boulder.map_path, "-o", tmp_path / "slim", "--images", *names, "--overwrite")
+        assert done.code == 0
+    assert list(read_map(tmp_path / "slim").images) == ["5.png"]
+    assert [path.name for path in tmp_path.iterdir()] == ["slim"]
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)], ids=str)
+def test_without_a_command_all_are_named(arguments):
+    outcome = slimsfm(*arguments)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert all(name in outcome.out for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command):
+    outcome = slimsfm(command, "--help")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out.startswith(f"usage: slimsfm {command}")
+
+
+def test_it_runs_as_a_module_of_its_own():
+    found = subprocess.run([sys.executable, "-m", "slimsfm", "--version"], capture_output=True, text=True)
+    assert (found.returncode, found.stderr) == (0, "")
+    assert found.stdout.startswith("slimsfm ")
+    unknown = subprocess.run([sys.executable, "-m", "slimsfm", "shrink"], capture_output=True, text=True)
+    assert (unknown.returncode, unknown.stdout) == (2, "")
+    assert unknown.stderr.startswith("slimsfm: 'shrink' is no command")

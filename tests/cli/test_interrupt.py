@@ -1,0 +1,117 @@
+"""Ctrl-C, or the system's wish to end: exit code 130, and nothing half-made is left behind."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from commands import contents
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
+PATIENCE_S = 20
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Starts the command in a process of its own, whose temporary files lie in a folder of the test."""
+    (tmp_path / "tmp").mkdir()
+    processes = []
+
+    def begin(*arguments):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "slimsfm", *map(str, arguments)],
+            env={**os.environ, "TMPDIR": str(tmp_path / "tmp"), "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        processes.append(process)
+        return process
+
+    yield begin
+    for process in processes:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
+
+def opened(process):
+    """Names of the files that a process holds open."""
+    names = set()
+    for link in Path(f"/proc/{process.pid}/fd").iterdir():
+        try:
+            names.add(os.readlink(link))
+        except OSError:
+            continue  # closed meanwhile
+    return names
+
+
+def wait_until(process, begun):
+    deadline = time.monotonic() + PATIENCE_S
+    while not begun():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def wait_until_reading(process, a_map):
+    wait_until(process, lambda: str(a_map / "features.h5") in opened(process))
+    time.sleep(0.2)  # HDF5 swallows what is raised in its callbacks, while the file is being opened
+
+
+def assert_interrupted(process, how, tmp_path):
+    if how == signal.SIGINT:
+        os.killpg(process.pid, how)  # as a terminal does
+    else:
+        process.send_signal(how)
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130, (out, err)
+    assert [line for line in err.splitlines() if line.strip()] == [
+        "slimsfm: interrupted; nothing half-made was left behind"
+    ]
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("stage", ["features.h5", "database.db"])
+def test_an_interrupted_build_leaves_nothing(boulder, start, tmp_path, how, stage):
+    process = start("build", boulder.photos, "-o", tmp_path / "out" / "map")
+    wait_until(process, lambda: list((tmp_path / "tmp").glob(f"slimsfm-build-*/{stage}")))
+    assert_interrupted(process, how, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["tmp"]
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_an_interrupted_reduction_leaves_nothing(boulder, start, tmp_path, how):
+    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph.npz"))
+    before = contents(a_map)
+    process = start("reduce", a_map, "-o", tmp_path / "slim")
+    wait_until_reading(process, a_map)
+    assert_interrupted(process, how, tmp_path)
+    assert contents(a_map) == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map", "tmp"]
+
+
+def test_an_interrupted_command_keeps_what_it_would_have_replaced(boulder, start, tmp_path):
+    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph.npz"))
+    (tmp_path / "slim").mkdir()
+    (tmp_path / "slim" / "notes.txt").write_text("mine")
+    process = start("reduce", a_map, "-o", tmp_path / "slim", "--overwrite")
+    wait_until_reading(process, a_map)
+    assert_interrupted(process, signal.SIGINT, tmp_path)
+    assert contents(tmp_path / "slim") == {"notes.txt": b"mine"}
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_an_interrupted_synthesis_leaves_nothing(start, tmp_path, how):
+    process = start("synthesize", "-o", tmp_path / "out", "--objects", "can", "--mapping-frames", 500)
+    wait_until(process, lambda: list(tmp_path.glob("out/.can.partial/can-1/color_full/*.png")))
+    assert_interrupted(process, how, tmp_path)
+    assert list((tmp_path / "out").iterdir()) == []

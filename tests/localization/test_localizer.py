@@ -1,0 +1,67 @@
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from scenes import camera
+from slimsfm.geometry import corner_error
+from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
+from slimsfm.localization.cameras import scaled_camera
+from slimsfm.photos import read_image
+
+BLACK = np.zeros((240, 320, 3), np.uint8)
+
+
+def test_an_image_of_nothing_has_no_pose_but_took_time(boulder):
+    found = Localizer(boulder.map).localize(BLACK)
+    assert found.pose is None
+    assert found.num_matches == 0
+    seconds = found.seconds
+    assert min(seconds.extract, seconds.match, seconds.pose) > 0
+    assert seconds.total == seconds.extract + seconds.match + seconds.pose
+
+
+def test_a_map_with_several_cameras_wants_one_given(two_cameras):
+    with pytest.raises(ValueError, match="camera must be given"):
+        Localizer(two_cameras).localize(BLACK)
+
+
+def test_a_given_camera_serves_whatever_the_map_has(boulder):
+    map_, path = boulder.map, boulder.mapping.image_paths[12]
+    wrong = pycolmap.Camera(map_.shared_camera.todict())
+    wrong.params = wrong.params * [1.3, 1.3, 1, 1]
+    truth = map_.images[path.name].cam_from_world()
+    found = Localizer(map_).localize(read_image(path), wrong).pose.cam_from_world
+    assert corner_error(found, truth, map_.box) > 0.1
+
+
+@pytest.mark.parametrize("shape", [(640, 480, 3), (480, 480, 3)], ids=str)
+def test_the_camera_of_the_map_does_not_stand_in_for_one_of_another_shape(exact, shape):
+    with pytest.raises(ValueError, match=f"image of {shape[1]}x{shape[0]}"):
+        Localizer(exact).localize(np.zeros(shape, np.uint8))
+
+
+def test_a_camera_of_another_size_is_refused(exact):
+    with pytest.raises(ValueError, match="size 320x240, got 640x480"):
+        Localizer(exact).localize(np.zeros((240, 320, 3), np.uint8), camera())
+
+
+@pytest.mark.parametrize("strategy", sorted(STRATEGIES))
+def test_rendered_references_are_found_where_they_are(boulder, strategy):
+    map_ = boulder.map
+    localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
+    for path in boulder.mapping.image_paths[4:20:5]:
+        found = localizer.localize(read_image(path)).pose
+        assert corner_error(found.cam_from_world, map_.images[path.name].cam_from_world(), map_.box) < 0.03
+
+
+def test_a_resized_image_is_localized_with_the_scaled_camera(boulder):
+    map_ = boulder.map
+    path = boulder.mapping.image_paths[12]
+    small = read_image(path)
+    large = np.asarray(cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC), np.uint8)
+    localizer = Localizer(map_)
+    found = localizer.localize(large).pose.cam_from_world
+    assert corner_error(found, map_.images[path.name].cam_from_world(), map_.box) < 0.01
+    given = localizer.localize(large, scaled_camera(map_.shared_camera, 640, 480)).pose.cam_from_world
+    assert np.array_equal(found.matrix(), given.matrix())

@@ -1,0 +1,131 @@
+import csv
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+
+from scenes import camera, poses
+from slimsfm.errors import OutputError
+from slimsfm.localization import Localization, Seconds
+from slimsfm.localization.pose_files import write_poses
+from slimsfm.pose import PoseEstimate
+
+TRUTH = dict(zip(["a.png", "b/deep.jpg", "c,d.png", "lost.png", "z.png"], poses(5), strict=True))
+FOUND = {name: pose for name, pose in TRUTH.items() if name != "lost.png"}
+
+
+@pytest.fixture
+def results():
+    seconds = Seconds(extract=0.0101, match=0.002, pose=0.0003)
+    inliers = np.arange(20) < 15
+    return {
+        name: Localization(
+            pose=PoseEstimate(cam_from_world=TRUTH[name], inliers=inliers) if name in FOUND else None,
+            num_matches=20,
+            seconds=seconds,
+        )
+        for name in TRUTH
+    }
+
+
+def rigid(quaternion_xyzw, translation):
+    rotation = pycolmap.Rotation3d(np.array(quaternion_xyzw, np.float64))
+    return pycolmap.Rigid3d(rotation, np.array(translation, np.float64))
+
+
+def assert_equal_poses(read):
+    assert list(read) == list(FOUND)
+    for name, pose in read.items():
+        assert np.allclose(pose.matrix(), FOUND[name].matrix(), rtol=0, atol=1e-9)
+
+
+def test_json_gives_the_poses_back_and_knows_of_the_lost(results, tmp_path):
+    write_poses(tmp_path / "poses.json", results)
+    data = json.loads((tmp_path / "poses.json").read_text())
+    assert "x_in_cam = R @ x_in_world + t" in data["convention"]
+    images = {image["name"]: image for image in data["images"]}
+    assert list(images) == list(TRUTH)
+    lost = images["lost.png"]
+    assert (lost["localized"], lost["cam_from_world"], lost["inliers"], lost["matches"]) == (
+        False,
+        None,
+        0,
+        20,
+    )
+    found = {name: image["cam_from_world"] for name, image in images.items() if image["localized"]}
+    assert_equal_poses(
+        {name: rigid(pose["quaternion_xyzw"], pose["translation"]) for name, pose in found.items()}
+    )
+    one = images["a.png"]
+    assert (one["inliers"], one["ms_extract"], one["ms_match"], one["ms_pose"], one["ms_total"]) == (
+        15,
+        10.1,
+        2.0,
+        0.3,
+        12.4,
+    )
+
+
+def test_csv_gives_the_poses_back_and_knows_of_the_lost(results, tmp_path):
+    write_poses(tmp_path / "poses.csv", results)
+    with (tmp_path / "poses.csv").open(newline="") as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+    assert list(rows) == list(TRUTH)
+    assert rows["lost.png"]["qw"] == rows["lost.png"]["tz"] == ""
+    assert rows["lost.png"]["inliers"] == "0"
+    assert rows["a.png"]["ms_total"] == "12.4"
+    assert_equal_poses(
+        {
+            name: rigid([row[q] for q in ("qx", "qy", "qz", "qw")], [row[t] for t in ("tx", "ty", "tz")])
+            for name, row in rows.items()
+            if row["qw"]
+        }
+    )
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "poses.tum"])
+def test_tum_gives_the_poses_back_by_index(results, tmp_path, name):
+    write_poses(tmp_path / name, results)
+    table = np.loadtxt(tmp_path / name)
+    names = list(TRUTH)
+    assert_equal_poses({names[int(row[0])]: rigid(row[4:8], row[1:4]).inverse() for row in table})
+
+
+def test_colmap_reads_its_images_back(results, tmp_path):
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera())
+    model.write_text(tmp_path)
+    for name in ("images.txt", "frames.txt", "rigs.txt"):
+        (tmp_path / name).unlink()
+    write_poses(tmp_path / "images.txt", results)
+    read = pycolmap.Reconstruction()
+    read.read_text(tmp_path)
+    images = sorted(read.images.values(), key=lambda image: image.image_id)
+    assert_equal_poses({image.name: image.cam_from_world() for image in images})
+
+
+@pytest.mark.parametrize("name", ["poses.xml", "poses", "poses.json.gz"])
+def test_an_unknown_suffix_is_refused(results, tmp_path, name):
+    with pytest.raises(OutputError, match=r"\.json, \.csv, \.txt or \.tum"):
+        write_poses(tmp_path / name, results)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_poses_replace_a_file_only_when_allowed(results, tmp_path):
+    path = tmp_path / "poses.json"
+    path.write_text("mine")
+    with pytest.raises(OutputError, match="exists already"):
+        write_poses(path, results)
+    assert path.read_text() == "mine"
+    write_poses(path, results, overwrite=True)
+    assert json.loads(path.read_text())["images"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["poses.json", "poses.csv", "poses.txt", "images.txt"])
+def test_equal_results_give_equal_bytes(results, tmp_path, name):
+    write_poses(tmp_path / name, results)
+    first = (tmp_path / name).read_bytes()
+    write_poses(tmp_path / name, results, overwrite=True)
+    assert (tmp_path / name).read_bytes() == first

@@ -1,0 +1,274 @@
+import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from slimsfm.errors import ImageError, InputError, ModelError
+from slimsfm.features import unit_rows
+from slimsfm.localization.localizer import Localizer
+from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.io import read_map, write_map
+from slimsfm.photos import read_image
+from slimsfm.synthetic.scene import mapping_take
+
+
+def write_colmap_database(path, map_):
+    """The database that COLMAP would have left beside the model."""
+    with pycolmap.Database.open(path) as database:
+        for camera in map_.model.cameras.values():
+            database.write_camera(camera, use_camera_id=True)
+        for name, image in map_.images.items():
+            row = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
+            database.write_image(row, use_image_id=True)
+            database.write_keypoints(image.image_id, map_.features[name].keypoints)
+            descriptors = pycolmap.FeatureDescriptors(
+                type=pycolmap.FeatureExtractorType.SIFT, data=map_.features[name].descriptors
+            )
+            database.write_descriptors(image.image_id, descriptors)
+        for (a, b), pairs in map_.matches.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = pairs.astype(np.uint32)
+            database.write_two_view_geometry(map_.images[a].image_id, map_.images[b].image_id, geometry)
+
+
+def rows_of(database):
+    with closing(sqlite3.connect(database)) as opened:
+        return list(opened.iterdump())
+
+
+def write_hloc(folder, map_, wrong=0):
+    """Features and matches as hloc writes them, half precision, with some wrong matches."""
+    rng = np.random.default_rng(0)
+    with h5py.File(folder / "features.h5", "w") as file:
+        for name in map_.images:
+            one, group = map_.features[name], file.create_group(name)
+            group["keypoints"] = one.keypoints - 0.5
+            group["descriptors"] = unit_rows(one.descriptors).astype(np.float16).T
+            group["scores"] = one.scores.astype(np.float16)
+            group["image_size"] = np.array(one.image_size)
+    with h5py.File(folder / "matches.h5", "w") as file:
+        for (a, b), pairs in map_.matches.items():
+            targets = np.full(len(map_.features[a]), -1, np.int16)
+            targets[rng.integers(0, len(targets), wrong)] = rng.integers(0, len(map_.features[b]), wrong)
+            targets[pairs[:, 0]] = pairs[:, 1]
+            file[f"{a.replace('/', '-')}/{b.replace('/', '-')}/matches0"] = targets
+
+
+@dataclass(frozen=True)
+class Project:
+    """COLMAP's project of a built map: model, database, hloc's files."""
+
+    folder: Path
+    model: Path
+
+
+@pytest.fixture(scope="session")
+def project(posed, tmp_path_factory) -> Project:
+    folder = tmp_path_factory.mktemp("project")
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    posed.build.map.model.write_binary(model)
+    write_colmap_database(folder / "database.db", posed.build.map)
+    write_hloc(folder, posed.build.map, wrong=60)
+    return Project(folder, model)
+
+
+@pytest.fixture
+def editable(project, tmp_path) -> Project:
+    shutil.copytree(project.folder, tmp_path / "project")
+    return Project(tmp_path / "project", tmp_path / "project" / "sparse" / "0")
+
+
+def poses_of_queries(map_):
+    localizer = Localizer(map_)
+    between = mapping_take("printed_box", 90, 320, 240, 0)  # the same object, other views
+    found = []
+    for index in (3, 5):
+        pose = localizer.localize(between.frame(index)).pose
+        assert pose is not None
+        found.append(pose.cam_from_world.matrix())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("kind", ["new binary", "new text", "old binary", "old text"])
+def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, posed, tmp_path, kind):
+    model = tmp_path / "model"
+    model.mkdir()
+    original = posed.build.map
+    (original.model.write_text if "text" in kind else original.model.write_binary)(model)
+    if "old" in kind:
+        for path in [*model.glob("rigs.*"), *model.glob("frames.*")]:
+            path.unlink()
+    map_ = import_model(model, ImportOptions(database=project.folder / "database.db"))
+    assert list(map_.images) == list(original.images)
+    assert np.array_equal(map_.point3D_ids, original.point3D_ids)
+    assert np.array_equal(map_.points3D_in_world, original.points3D_in_world)
+    assert list(map_.matches) == list(original.matches)
+    for pair, pairs in original.matches.items():
+        assert np.array_equal(map_.matches[pair], pairs)
+    for name in original.images:
+        assert np.array_equal(map_.features[name].descriptors, original.features[name].descriptors)
+        assert np.array_equal(map_.features[name].keypoints, original.features[name].keypoints)
+        assert map_.features[name].image_size == (320, 240)
+    expected = poses_of_queries(original)
+    # Text holds unit quaternions that are not quite, so that poses differ in the last digit.
+    assert poses_of_queries(map_) == pytest.approx(expected, abs=1e-6 if "text" in kind else 0)
+    write_map(map_, tmp_path / "map")
+    assert np.array_equal(poses_of_queries(read_map(tmp_path / "map")), poses_of_queries(map_))
+
+
+def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable):
+    before = rows_of(editable.folder / "database.db")
+    map_ = import_model(editable.model)
+    assert len(map_.matches) > 5
+    assert map_.info.box_source == "estimated"
+    assert "database" in map_.info.origin
+    assert rows_of(editable.folder / "database.db") == before
+    assert [path.name for path in editable.folder.glob("database*")] == ["database.db"]
+
+
+def test_a_model_without_a_database_says_what_else_there_is(editable):
+    (editable.folder / "database.db").unlink()
+    with pytest.raises(
+        InputError, match=r"no database\.db beside the model.*--database.*--features.*--images"
+    ):
+        import_model(editable.model)
+    with pytest.raises(InputError, match="no such database"):
+        import_model(editable.model, ImportOptions(database=editable.folder / "database.db"))
+
+
+@pytest.mark.parametrize("damage", ["text", "cut", "empty", "other"])
+def test_a_damaged_database_is_an_input_error(editable, damage):
+    path = editable.folder / "database.db"
+    whole = path.read_bytes()
+    path.write_bytes({"text": b"hello", "cut": whole[:20_000], "empty": b"", "other": whole[:100]}[damage])
+    with pytest.raises(InputError, match=r"database\.db"):
+        import_model(editable.model)
+
+
+def test_a_database_of_other_images_is_a_model_error(editable, posed):
+    path = editable.folder / "database.db"
+    path.unlink()
+    with pycolmap.Database.open(path) as database:
+        database.write_camera(posed.build.map.shared_camera)
+    with pytest.raises(ModelError, match=r"database\.db: has no descriptors of image 'take 1/frame 0\.png'"):
+        import_model(editable.model)
+
+
+def test_features_of_another_run_are_a_model_error(editable):
+    path = editable.folder / "features.h5"
+    with h5py.File(path, "r+") as file:
+        group = file["take 1/frame 3.png"]
+        for part in ("keypoints", "scores"):
+            shorter = group[part][:-1]
+            del group[part]
+            group[part] = shorter
+        shorter = group["descriptors"][:, :-1]
+        del group["descriptors"]
+        group["descriptors"] = shorter
+    with pytest.raises(ModelError, match=r"frame 3\.png' has \d+ keypoints in the model but \d+ in the feat"):
+        import_model(editable.model, ImportOptions(features=path))
+    with h5py.File(path, "r+") as file:
+        del file["take 1/frame 3.png"]
+    with pytest.raises(ModelError, match=r"features\.h5: has no features of image 'take 1/frame 3\.png'"):
+        import_model(editable.model, ImportOptions(features=path))
+
+
+def test_files_of_hloc_give_the_same_poses_and_their_wrong_matches_go(project, posed):
+    options = ImportOptions(features=project.folder / "features.h5", matches=project.folder / "matches.h5")
+    map_, original = import_model(project.model, options), posed.build.map
+    for name in original.images:
+        assert map_.features[name].descriptors.dtype == np.float16
+        assert map_.features[name].keypoints == pytest.approx(original.features[name].keypoints, abs=1e-4)
+    found, true = poses_of_queries(map_), poses_of_queries(original)
+    assert found == pytest.approx(true, abs=5e-3)
+    kept = wrong = lost = 0
+    for pair, pairs in original.matches.items():
+        right = set(map(tuple, pairs.tolist()))
+        ours = set(map(tuple, map_.matches[pair].tolist())) if pair in map_.matches else set()
+        kept, wrong, lost = kept + len(ours & right), wrong + len(ours - right), lost + len(right - ours)
+    assert lost < 0.05 * kept
+    # By chance a wrong match lies within the tolerance of its epipolar line; of 60 a pair few do.
+    assert wrong < 0.15 * 60 * len(original.matches)
+
+
+def test_matches_of_keypoints_that_are_not_there_are_named(editable):
+    with h5py.File(editable.folder / "matches.h5", "r+") as file:
+        next(iter(next(iter(file.values())).values()))["matches0"][0] = 30_000
+    options = ImportOptions(features=editable.folder / "features.h5", matches=editable.folder / "matches.h5")
+    with pytest.raises(ModelError, match=r"matches\.h5.*keypoint"):
+        import_model(editable.model, options)
+
+
+def test_features_without_matches_give_a_map_without(project):
+    map_ = import_model(project.model, ImportOptions(features=project.folder / "features.h5"))
+    assert map_.matches == {}
+
+
+def test_keypoints_are_described_again_from_the_images(project, posed, rendered):
+    map_ = import_model(project.model, ImportOptions(images=rendered.folder))
+    cosines = []
+    for name, seen in posed.build.map.observations.items():
+        one, two = (unit_rows(m.features[name].descriptors[seen.rows]) for m in (map_, posed.build.map))
+        cosines.append((one * two).sum(axis=1))
+    assert np.mean(np.concatenate(cosines) > 0.9) > 0.8
+    true = poses_of_queries(posed.build.map)
+    assert poses_of_queries(map_) == pytest.approx(true, abs=0.02)
+
+
+def test_images_that_are_missing_or_of_another_size_are_named(project, rendered, tmp_path):
+    folder = tmp_path / "images"
+    shutil.copytree(rendered.folder, folder)
+    path = folder / rendered.names[2]
+    Image.fromarray(read_image(path)[:200]).save(path)
+    with pytest.raises(
+        ImageError, match=r"frame 2\.png: 320x200 pixels, but its camera in the model has 320x240"
+    ):
+        import_model(project.model, ImportOptions(images=folder))
+    path.write_text("hello")
+    with pytest.raises(ImageError, match=r"frame 2\.png: not a readable image"):
+        import_model(project.model, ImportOptions(images=folder))
+    path.unlink()
+    with pytest.raises(ImageError, match=r"frame 2\.png: no such image"):
+        import_model(project.model, ImportOptions(images=folder))
+    with pytest.raises(InputError, match="no such folder of images"):
+        import_model(project.model, ImportOptions(images=tmp_path / "missing"))
+
+
+def test_images_of_something_else_are_a_model_error(project, rendered, tmp_path):
+    for name in rendered.names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(np.full((240, 320, 3), 90, np.uint8)).save(tmp_path / name)
+    with pytest.raises(ModelError, match=r"at only 0 of the .* keypoints"):
+        import_model(project.model, ImportOptions(images=tmp_path))
+
+
+def test_a_model_without_points_is_a_model_error(project, tmp_path):
+    model = pycolmap.Reconstruction(project.model)
+    for i in list(model.point3D_ids()):
+        model.delete_point3D(i)
+    model.write_binary(tmp_path)
+    with pytest.raises(ModelError, match="no 3D points; triangulate it first"):
+        import_model(tmp_path, ImportOptions(database=project.folder / "database.db"))
+
+
+def test_a_given_box_is_taken(project, rendered, tmp_path):
+    np.savetxt(tmp_path / "box3d_corners.txt", rendered.known.box.corners)
+    map_ = import_model(project.model, ImportOptions(box=tmp_path / "box3d_corners.txt"))
+    assert map_.info.box_source == "given"
+    assert map_.box.diagonal == pytest.approx(rendered.known.box.diagonal)
+
+
+def test_one_source_of_descriptors_is_enough():
+    path = Path("x")
+    with pytest.raises(ValueError, match="database and images: give just one"):
+        ImportOptions(database=path, images=path)
+    with pytest.raises(ValueError, match="matches needs features"):
+        ImportOptions(matches=path)

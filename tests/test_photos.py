@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from slimsfm.errors import ImageError, InputError
+from slimsfm.photos import camera_from_exif, list_images, read_image, read_mask
+
+UPRIGHT = np.zeros((4, 6, 3), np.uint8)
+UPRIGHT[0, 0], UPRIGHT[0, -1], UPRIGHT[-1, 0], UPRIGHT[-1, -1] = (
+    (255, 0, 0),
+    (0, 255, 0),
+    (0, 0, 255),
+    (255, 255, 0),
+)
+# What a camera stores whose picture is turned upright by each EXIF orientation.
+STORED = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.transpose(1, 0, 2),
+    6: lambda a: np.rot90(a, 1),
+    7: lambda a: a[::-1, ::-1].transpose(1, 0, 2),
+    8: lambda a: np.rot90(a, -1),
+}
+
+
+def exif(orientation=1, focal_35mm=None):
+    data = Image.Exif()
+    data[ExifTags.Base.Orientation] = orientation
+    if focal_35mm:
+        data.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm
+    return data
+
+
+def noise(height=40, width=60):
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_images_are_read_upright(tmp_path, orientation):
+    stored = np.ascontiguousarray(STORED[orientation](UPRIGHT))
+    Image.fromarray(stored).save(tmp_path / "a.png", exif=exif(orientation))
+    assert np.array_equal(read_image(tmp_path / "a.png"), UPRIGHT)
+    camera = camera_from_exif(tmp_path / "a.png")
+    assert (camera.width, camera.height) == (6, 4)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_focal_length_comes_from_exif_and_the_size_is_upright(tmp_path, orientation):
+    Image.fromarray(noise()).save(tmp_path / "a.jpg", exif=exif(orientation, focal_35mm=28))
+    camera = camera_from_exif(tmp_path / "a.jpg")
+    diagonal_of_film, diagonal = np.hypot(36, 24), np.hypot(60, 40)
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == pytest.approx(28 / diagonal_of_film * diagonal, rel=1e-4)
+    width, height = (60, 40) if orientation < 5 else (40, 60)
+    assert (camera.width, camera.height) == (width, height)
+    assert camera.params[1:].tolist() == [width / 2, height / 2, 0]
+
+
+def test_without_exif_the_focal_length_is_guessed_and_said_to_be(tmp_path):
+    Image.fromarray(noise()).save(tmp_path / "a.jpg")
+    camera = camera_from_exif(tmp_path / "a.jpg")
+    assert not camera.has_prior_focal_length
+    assert camera.focal_length == pytest.approx(1.2 * 60)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA", "CMYK", "I;16"])
+def test_every_kind_of_pixel_is_read_as_rgb(tmp_path, mode):
+    gray = np.array([[0, 64], [128, 255]], np.uint8)
+    values = gray.astype(np.uint16) * 257 if mode == "I;16" else gray
+    image = Image.fromarray(values) if mode == "I;16" else Image.fromarray(gray).convert(mode)
+    image.save(tmp_path / "a.tif")
+    read = read_image(tmp_path / "a.tif")
+    expected = gray if mode != "1" else np.asarray(image) * np.uint8(255)
+    assert np.array_equal(read, np.repeat(expected[..., None], 3, axis=2))
+
+
+def test_masks_are_gray_of_any_colour(tmp_path):
+    Image.fromarray(UPRIGHT).save(tmp_path / "mask.png")
+    assert np.array_equal(read_mask(tmp_path / "mask.png") > 0, UPRIGHT.any(axis=2))
+
+
+@pytest.mark.parametrize("read", [read_image, read_mask, camera_from_exif])
+@pytest.mark.parametrize("damage", ["text", "empty", "folder", "missing"])
+def test_what_is_no_image_is_named(tmp_path, read, damage):
+    path = tmp_path / "photo.jpg"
+    if damage == "folder":
+        path.mkdir()
+    elif damage != "missing":
+        path.write_text("hello" if damage == "text" else "")
+    with pytest.raises(ImageError, match=r"photo\.jpg: (no such|not a readable) image"):
+        read(path)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "bmp", "tif"])
+def test_a_file_cut_short_is_an_image_error_at_any_length(tmp_path, suffix):
+    path = tmp_path / f"photo.{suffix}"
+    Image.fromarray(noise()).save(path)
+    whole = path.read_bytes()
+    for length in range(0, int(0.95 * len(whole)), len(whole) // 15):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ImageError, match="photo"):
+            read_image(path)
+
+
+def test_images_are_listed_in_order_with_folders_and_without_hidden_ones(tmp_path):
+    for name in ("b.JPG", "a 1.png", "sub/c.jpeg", "sub/deep/ä.webp", ".hidden.png", ".trash/d.png", "e.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "folder.png").mkdir()
+    assert list_images(tmp_path) == ["a 1.png", "b.JPG", "sub/c.jpeg", "sub/deep/ä.webp"]
+
+
+def test_a_folder_below_a_hidden_one_is_not_hidden_itself(tmp_path):
+    folder = tmp_path / ".cache" / "photos"
+    folder.mkdir(parents=True)
+    (folder / "a.png").write_bytes(b"")
+    assert list_images(folder) == ["a.png"]
+
+
+def test_a_folder_without_images_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="holds no image"):
+        list_images(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        list_images(tmp_path / "missing")
