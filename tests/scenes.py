@@ -1,6 +1,7 @@
 """A tiny exact scene: points on and in a box, cameras around it, keypoints where the points project."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pycolmap
@@ -28,7 +29,7 @@ def poses(count: int) -> list[pycolmap.Rigid3d]:
 
 
 def exact_map(num_images: int = 6, num_points: int = 120, seed: int = 0, reach_deg: float = 180.0) -> Map:
-    """A map without any error, whose points are seen by the cameras within `reach_deg` of their own direction.
+    """A map without any error, whose points are seen by cameras within `reach_deg` of their direction.
 
     Each point has a descriptor of its own, equal in every image; each image has 20 more keypoints that see
     nothing.
@@ -70,7 +71,7 @@ def with_matches(map_: Map) -> Map:
     """The same map with the matches between consecutive images that its tracks imply."""
     names = list(map_.images)
     matches = {}
-    for a, b in zip(names[:-1], names[1:], strict=True):
+    for a, b in pairwise(names):
         of_a, of_b = map_.observations[a], map_.observations[b]
         _, rows_a, rows_b = np.intersect1d(of_a.points, of_b.points, return_indices=True)
         pairs = np.stack([of_a.rows[rows_a], of_b.rows[rows_b]], axis=1)

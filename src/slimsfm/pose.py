@@ -33,6 +33,8 @@ class RansacOptions:
             raise ValueError(f"max_error_px must be positive, got {self.max_error_px}")
         if self.min_inliers < _MINIMAL + 1:
             raise ValueError(f"min_inliers must be at least {_MINIMAL + 1}, got {self.min_inliers}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
         if self.max_iterations < 1:
             raise ValueError(f"max_iterations must be at least 1, got {self.max_iterations}")
 

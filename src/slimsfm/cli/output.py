@@ -130,7 +130,7 @@ def print_rows(rows: Sequence[Row]) -> None:
         table.add_row(*_cells(row, metric=metric, several=several))
     console.print(table)
     console.print(
-        "0.1d, 0.05d, 0.02d: % of queries whose box corners are off by less than this share of the diagonal d; "
+        "0.1d, 0.05d, 0.02d: % of queries with box corners off by less than this share of the diagonal d; "
         "median: of that error; found: % with any pose",
         style="dim",
     )

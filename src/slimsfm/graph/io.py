@@ -14,7 +14,7 @@ from slimsfm.progress import ProgressBar, silent
 
 
 def graph_key(map: Map, options: GraphOptions) -> str:
-    """Equal for equal maps and options: a graph is reused only where its key is that of the work asked for."""
+    """Equal for equal maps and options: only where the keys are equal is a graph reused."""
     digest = hashlib.sha256(repr((options, map.info.extractor, map.info.extractor_options)).encode())
     digest.update(map.box.corners.tobytes())
     digest.update(map.point3D_ids.tobytes())
@@ -48,7 +48,7 @@ def read_graph(path: Path, key: str) -> ReferenceGraph | None:
 def graph_of(
     map: Map, path: Path | None, options: GraphOptions = GraphOptions(), progress: ProgressBar = silent
 ) -> ReferenceGraph:
-    """The reference graph of a map: read from `path` if it is there and fits, else computed and written there."""
+    """The reference graph of a map: read from `path` if that fits, else computed and written there."""
     key = graph_key(map, options)
     graph = read_graph(path, key) if path else None
     if graph is None:

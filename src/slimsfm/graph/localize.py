@@ -47,8 +47,8 @@ def localize_pairs(
 ) -> ReferenceGraph:
     """Localize every reference image from every other one alone.
 
-    For the pair (u, v) the keypoints of v are matched against the points that u sees, each described as u sees
-    it; the pose of v estimated from these matches is compared with its pose in the map.
+    For the pair (u, v) the keypoints of v are matched against the points that u sees, each described as u
+    sees it; the pose of v estimated from these matches is compared with its pose in the map.
 
     Complexity: n (n - 1) matchings of all keypoints with the points of one image.
     """

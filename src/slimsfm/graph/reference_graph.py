@@ -17,7 +17,7 @@ class ReferenceGraph:
     """The reference images, sorted."""
 
     errors: Float64[np.ndarray, "n n"]
-    """[u, v] is the relative corner error of v's pose estimated from u alone; infinite where there is none."""
+    """[u, v] is the relative corner error of v's pose estimated from u alone; infinite without a pose."""
 
     def adjacency(self, threshold: float = 0.05) -> Bool[np.ndarray, "n n"]:
         """[u, v] is true where u localizes v: the error is below the threshold."""

@@ -125,6 +125,6 @@ class Localizer:
         camera = shared and scaled_camera(shared, width, height)
         if camera is None:
             raise ValueError(
-                f"camera must be given: the map has no one camera that could have taken an image of {width}x{height}"
+                f"camera must be given: the map has no one camera for an image of {width}x{height} pixels"
             )
         return camera

@@ -20,8 +20,9 @@ def write_poses(path: Path, results: Results, *, overwrite: bool = False) -> Non
     """Write poses in the format that the path's suffix names.
 
     .json and .csv hold every query, localized or not, with times; .txt holds those localized: as COLMAP's
-    images.txt if that is the file's name, else as a TUM trajectory (`index tx ty tz qx qy qz qw`, the pose of the
-    camera in the world, index counting the queries). COLMAP reads a name in images.txt up to its first space.
+    images.txt if that is the file's name, else as a TUM trajectory (`index tx ty tz qx qy qz qw`, the pose of
+    the camera in the world, index counting the queries). COLMAP reads a name in
+    images.txt up to its first space.
 
     Raises:
         OutputError: The suffix is none of these, or the file cannot be written.

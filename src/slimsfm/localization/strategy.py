@@ -33,6 +33,6 @@ class Strategy(Protocol):
 
 
 def unite(parts: list[Int64[np.ndarray, "_ 2"]]) -> PointMatches:
-    """Join pairs (keypoint, point) from several sources; equal pairs become one. Sorted by keypoint, point."""
+    """Join pairs (keypoint, point) from several sources; equal ones become one. Sorted."""
     pairs = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *parts]), axis=0)
     return PointMatches(keypoints=pairs[:, 0], points=pairs[:, 1])

@@ -46,6 +46,10 @@ class BuildOptions:
     seed: int = 0
     """Seed of every random choice."""
 
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class KnownPoses:
