@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 
 from slimsfm.geometry import corner_error
-from slimsfm.graph import localize_pairs
+from slimsfm.graph import compute_graph
 from slimsfm.localization import Localizer
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.importing import import_model
@@ -49,7 +49,7 @@ def compare(folder: Path, temporary: Path) -> None:
     for name in set(names) - set(queries):
         os.symlink(folder / name, references / name)
     built = build_map(references, temporary / "build", progress=shown).map
-    slim = reduce_map(built, localize_pairs(built, progress=shown)).map
+    slim = reduce_map(built, compute_graph(built, progress=shown).graph).map
     cameras = dict.fromkeys(queries, built.shared_camera)
     expected = localize(slim, folder, cameras)
     for form in ("old binary", "text", "rigs and frames"):

@@ -1,3 +1,5 @@
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,3 +21,18 @@ def photos() -> Path:
     if not folder.is_dir():
         pytest.skip("needs the real photographs in ../shared/data, which are not here")
     return folder
+
+
+@pytest.fixture(scope="session")
+def scheduler() -> Iterator[str]:
+    """The address of a Dask cluster of two worker processes; a task that kills one of them is not sent on."""
+    dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
+    with (
+        dask.config.set(
+            {"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": "2s"}
+        ),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
+        ) as cluster,
+    ):
+        yield cluster.scheduler_address

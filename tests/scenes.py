@@ -8,10 +8,12 @@ import pycolmap
 
 from slimsfm.features import Features
 from slimsfm.geometry import Box, project
+from slimsfm.graph import GraphOptions, ReferenceGraph, compute_graph
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.synthetic.trajectory import look_at
 
 BOX = Box(np.zeros(3), np.diag([1.0, 0.8, 0.6]))
+ALGORITHM_1 = GraphOptions(edges="localize", candidates="all")  # as the paper states it
 
 
 def camera(model: str = "OPENCV") -> pycolmap.Camera:
@@ -77,6 +79,17 @@ def with_matches(map_: Map) -> Map:
         pairs = np.stack([of_a.rows[rows_a], of_b.rows[rows_b]], axis=1)
         matches[a, b] = pairs[np.argsort(pairs[:, 0])]
     return replace(map_, matches=matches)
+
+
+def graph_from_dense(names: tuple[str, ...], errors: np.ndarray) -> ReferenceGraph:
+    """The graph with these errors on all pairs of two different images."""
+    pairs = np.argwhere(~np.eye(len(names), dtype=bool))
+    return ReferenceGraph.from_errors(names, pairs, errors[pairs[:, 0], pairs[:, 1]])
+
+
+def algorithm_1(map_: Map) -> ReferenceGraph:
+    """The reference graph by the paper's Algorithm 1."""
+    return compute_graph(map_, ALGORITHM_1).graph
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

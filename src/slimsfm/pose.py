@@ -9,7 +9,7 @@ import pycolmap
 from slimsfm.arrays import Mask, Points2D, Points3D
 
 _MINIMAL = 3  # matches that P3P needs
-_MIN_ITERATIONS = 100  # hypotheses; a low share of inliers asks for more by itself
+_MIN_ITERATIONS = 30  # hypotheses; a low share of inliers asks for more by itself
 
 
 @dataclass(frozen=True, kw_only=True)

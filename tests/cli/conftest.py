@@ -25,7 +25,7 @@ def reduced(boulder, tmp_path_factory) -> Reduced:
     """The rendered object's map, made slim by the command; the map's graph is kept beside it."""
     path = tmp_path_factory.mktemp("reduced") / "slim"
     outcome = slimsfm("reduce", boulder.map_path, "-o", path)
-    return Reduced(path, boulder.map_path / "graph.npz", outcome)
+    return Reduced(path, boulder.map_path / "graph-matches.npz", outcome)
 
 
 @pytest.fixture

@@ -73,7 +73,7 @@ def test_reduce_keeps_a_dominating_set(boulder, reduced):
     assert_done(reduced.outcome, reduced.path, "localize")
     assert "proven smallest" in reduced.outcome.out
     full, slim = boulder.map, read_map(reduced.path)
-    graph = graph_of(full, reduced.graph, progress=_never)
+    graph = graph_of(full, reduced.graph.parent, progress=_never).graph
     kept = [graph.names.index(name) for name in slim.images]
     assert dominates(graph.adjacency(), kept)
     assert 1 <= len(kept) < MAPPING_FRAMES
@@ -107,12 +107,14 @@ def test_reduce_to_named_and_to_random_images(boulder, tmp_path):
 
 
 @pytest.mark.parametrize("strategy", ["exhaustive", "direct"])
-def test_localize_references_in_full_and_slim_map(boulder, reduced, tmp_path, strategy):
+def test_localize_references_in_full_and_slim_map(boulder, tmp_path, strategy):
+    slim = tmp_path / "slim"
+    assert slimsfm("reduce", boulder.map_path, "-o", slim, "--edges", "localize").code == 0
     truth, photos = boulder.map, tmp_path / "photos"
     photos.mkdir()
     for path in boulder.mapping.image_paths[::3]:
         shutil.copy(path, photos)
-    for map_path in (boulder.map_path, reduced.path):
+    for map_path in (boulder.map_path, slim):
         output = tmp_path / f"{map_path.name}.json"
         done = slimsfm("localize", map_path, photos, "-o", output, "--strategy", strategy)
         assert_done(done, output, "info")

@@ -10,10 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from commands import contents
+from commands import contents, slimsfm
+from slimsfm.graph import GraphOptions
+from slimsfm.graph.io import graph_of
+from slimsfm.mapping.io import read_map
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
 PATIENCE_S = 20
+GOES_ON = "the same command goes on where it stopped"
 
 
 @pytest.fixture
@@ -22,9 +26,9 @@ def start(tmp_path):
     (tmp_path / "tmp").mkdir()
     processes = []
 
-    def begin(*arguments):
+    def begin(*arguments, how=("-m", "slimsfm")):
         process = subprocess.Popen(
-            [sys.executable, "-m", "slimsfm", *map(str, arguments)],
+            [sys.executable, *how, *map(str, arguments)],
             env={**os.environ, "TMPDIR": str(tmp_path / "tmp"), "OMP_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -61,21 +65,19 @@ def wait_until(process, begun):
         time.sleep(0.005)
 
 
-def wait_until_reading(process, a_map):
-    wait_until(process, lambda: str(a_map / "features.h5") in opened(process))
-    time.sleep(0.2)  # HDF5 swallows what is raised in its callbacks, while the file is being opened
+def wait_until_localizing(process, a_map):
+    partial = a_map / "graph-localize.partial"
+    wait_until(process, lambda: str(partial) in opened(process) and partial.stat().st_size >= 65)
 
 
-def assert_interrupted(process, how, tmp_path):
+def assert_interrupted(process, how, tmp_path, what_now="nothing half-made was left behind"):
     if how == signal.SIGINT:
         os.killpg(process.pid, how)  # as a terminal does
     else:
         process.send_signal(how)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130, (out, err)
-    assert [line for line in err.splitlines() if line.strip()] == [
-        "slimsfm: interrupted; nothing half-made was left behind"
-    ]
+    assert [line for line in err.splitlines() if line.strip()] == [f"slimsfm: interrupted; {what_now}"]
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
@@ -89,24 +91,59 @@ def test_an_interrupted_build_leaves_nothing(boulder, start, tmp_path, how, stag
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
-def test_an_interrupted_reduction_leaves_nothing(boulder, start, tmp_path, how):
-    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph.npz"))
+def test_an_interrupted_reduction_leaves_its_progress_and_nothing_else(boulder, start, tmp_path, how):
+    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph-*"))
     before = contents(a_map)
-    process = start("reduce", a_map, "-o", tmp_path / "slim")
-    wait_until_reading(process, a_map)
-    assert_interrupted(process, how, tmp_path)
-    assert contents(a_map) == before
+    process = start("reduce", a_map, "-o", tmp_path / "slim", "--edges", "localize")
+    wait_until_localizing(process, a_map)
+    assert_interrupted(process, how, tmp_path, GOES_ON)
+    after = contents(a_map)
+    assert len(after.pop("graph-localize.partial")) >= 65
+    assert after == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map", "tmp"]
 
 
 def test_an_interrupted_command_keeps_what_it_would_have_replaced(boulder, start, tmp_path):
-    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph.npz"))
+    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph-*"))
     (tmp_path / "slim").mkdir()
     (tmp_path / "slim" / "notes.txt").write_text("mine")
-    process = start("reduce", a_map, "-o", tmp_path / "slim", "--overwrite")
-    wait_until_reading(process, a_map)
-    assert_interrupted(process, signal.SIGINT, tmp_path)
+    process = start("reduce", a_map, "-o", tmp_path / "slim", "--edges", "localize", "--overwrite")
+    wait_until_localizing(process, a_map)
+    assert_interrupted(process, signal.SIGINT, tmp_path, GOES_ON)
     assert contents(tmp_path / "slim") == {"notes.txt": b"mine"}
+
+
+SMALL_BLOCKS = """
+from slimsfm.graph import compute
+compute._BLOCK_SECONDS, compute._WORTH_SECONDS = 0.02, 0.0
+from slimsfm.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_interrupted_graph_goes_on_where_it_stopped(boulder, start, tmp_path, how, workers):
+    a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph-*"))
+    before, partial = contents(a_map), a_map / "graph-localize.partial"
+    command = ("graph", a_map, "--edges", "localize", "--workers", workers)
+    process = start(*command, how=("-c", SMALL_BLOCKS))
+    wait_until(process, lambda: partial.exists() and partial.stat().st_size > 65 + 24 * 40)
+    assert_interrupted(process, how, tmp_path, GOES_ON)
+    after = contents(a_map)
+    kept = after.pop("graph-localize.partial")
+    assert after == before
+    labels = []
+
+    def watch(items, label):
+        labels.append(label)
+        return iter(items)
+
+    run = graph_of(read_map(a_map), a_map, GraphOptions(edges="localize"), progress=watch)
+    assert int(labels[0].split()[1]) <= run.pairs_tried - (len(kept) - 65) // 24
+    again = slimsfm("graph", a_map, "--edges", "localize")
+    assert again.code == 0
+    assert not partial.exists()
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])

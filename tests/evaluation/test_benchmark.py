@@ -2,11 +2,10 @@ from dataclasses import replace
 
 import pytest
 
-from scenes import camera, exact_map
+from scenes import algorithm_1, camera, exact_map
 from slimsfm.domination import dominates
 from slimsfm.evaluation.benchmark import BenchmarkOptions, benchmark
 from slimsfm.evaluation.protocol import PreparedQuery, Query, errors_of, evaluate, localize_all, prepare
-from slimsfm.graph import localize_pairs
 from slimsfm.localization import STRATEGIES
 from slimsfm.reduction import ReductionOptions, keep_random_images
 
@@ -18,7 +17,7 @@ def narrow():
 
 @pytest.fixture(scope="module")
 def graph(narrow):
-    return localize_pairs(narrow)
+    return algorithm_1(narrow)
 
 
 @pytest.fixture

@@ -4,56 +4,66 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes import exact_map
+from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
+from slimsfm.errors import InputError
 from slimsfm.features import NearestOptions
 from slimsfm.geometry import Box
-from slimsfm.graph import GraphOptions, ReferenceGraph, localize_pairs
-from slimsfm.graph.io import graph_key, graph_of, read_graph, write_graph
+from slimsfm.graph import GraphOptions, compute
+from slimsfm.graph.io import graph_of, read_given_graph, write_graph
+from slimsfm.graph.key import graph_key
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.pose import RansacOptions
 
-GRAPH = ReferenceGraph(
-    names=("a.png", "sub/ü b.png"), errors=np.array([[0.0, 0.0123456789012345], [np.inf, 0.0]])
-)
+FILES = ["graph-localize.npz"]
 
 
 def assert_equal_graphs(a, b):
     assert a.names == b.names
-    assert np.array_equal(a.errors, b.errors)
+    assert np.array_equal(a.dense(), b.dense())
 
 
 def never(_items, label):
     raise AssertionError(f"{label}: computed though it was there")
 
 
-def test_a_graph_is_read_as_it_was_written(tmp_path):
-    write_graph(tmp_path / "graph.npz", GRAPH, "key")
-    assert_equal_graphs(read_graph(tmp_path / "graph.npz", "key"), GRAPH)
+def is_kept(map_, folder, options=ALGORITHM_1):
+    try:
+        graph_of(map_, folder, options, progress=never)
+    except AssertionError:
+        return False
+    return True
+
+
+@pytest.fixture
+def few_points():
+    """A map of three images, whose graph has edges and pairs without one."""
+    return exact_map(num_images=3, num_points=60, reach_deg=70.0)
+
+
+def test_a_graph_is_read_as_it_was_written(few_points, tmp_path):
+    names = tuple(few_points.images)
+    errors = np.array([[0.0, 0.0123456789012345, np.inf], [np.inf, 0.0, 0.0], [7.0, np.inf, 0.0]])
+    write_graph(tmp_path / "graph.npz", graph_from_dense(names, errors))
+    assert np.array_equal(read_given_graph(tmp_path / "graph.npz", few_points).dense(), errors)
     assert [path.name for path in tmp_path.iterdir()] == ["graph.npz"]
 
 
-def test_a_graph_of_other_work_is_none(tmp_path):
-    write_graph(tmp_path / "graph.npz", GRAPH, "key")
-    assert read_graph(tmp_path / "graph.npz", "another key") is None
-    assert read_graph(tmp_path / "missing.npz", "key") is None
-    assert read_graph(tmp_path, "key") is None
-
-
-def test_a_damaged_graph_is_none_and_never_a_wrong_one(tmp_path):
-    path = tmp_path / "graph.npz"
-    write_graph(path, GRAPH, "key")
+def test_a_damaged_graph_is_computed_again_and_never_a_wrong_one(few_points, tmp_path):
+    expected = graph_of(few_points, tmp_path, ALGORITHM_1).graph
+    path = tmp_path / FILES[0]
     whole = path.read_bytes()
-    for length in range(0, len(whole), 5):
+    for length in range(0, len(whole), 41):
         path.write_bytes(whole[:length])
-        assert read_graph(path, "key") is None
+        assert not is_kept(few_points, tmp_path)
     for position in range(len(whole)):
         damaged = bytearray(whole)
         damaged[position] ^= 1 << (position % 8)
         path.write_bytes(damaged)
-        graph = read_graph(path, "key")
-        if graph is not None:
-            assert_equal_graphs(graph, GRAPH)
+        if is_kept(few_points, tmp_path):
+            assert_equal_graphs(graph_of(few_points, tmp_path, ALGORITHM_1).graph, expected)
+    path.write_bytes(whole)
+    assert is_kept(few_points, tmp_path)
 
 
 def changed_map(map_, change):
@@ -106,50 +116,184 @@ def test_the_key_of_equal_maps_is_equal(exact, tmp_path):
     ids=["ratio", "seed", "error"],
 )
 def test_other_options_make_another_key_and_compute_again(exact, options, tmp_path):
-    path = tmp_path / "graph.npz"
-    graph_of(exact, path)
-    assert graph_key(exact, options) != graph_key(exact, GraphOptions())
-    with pytest.raises(AssertionError, match="computed though"):
-        graph_of(exact, path, options, progress=never)
-    graph_of(exact, path, options)
-    graph_of(exact, path, options, progress=never)
+    options = replace(options, edges="localize")
+    graph_of(exact, tmp_path, GraphOptions(edges="localize"))
+    assert graph_key(exact, options) != graph_key(exact, GraphOptions(edges="localize"))
+    assert not is_kept(exact, tmp_path, options)
+    graph_of(exact, tmp_path, options)
+    assert is_kept(exact, tmp_path, options)
+
+
+@pytest.mark.parametrize("edges", ["matches", "tracks", "localize"])
+def test_another_threshold_reuses_a_graph_that_does_not_depend_on_it(exact, edges, tmp_path):
+    graph_of(exact, tmp_path, GraphOptions(edges=edges))
+    assert is_kept(exact, tmp_path, GraphOptions(edges=edges, threshold=0.2))
+
+
+def test_hybrid_looks_closer_around_another_threshold(exact, tmp_path):
+    graph_of(exact, tmp_path, GraphOptions(edges="hybrid"))
+    assert not is_kept(exact, tmp_path, GraphOptions(edges="hybrid", threshold=0.2))
 
 
 def test_a_graph_is_computed_once(exact, tmp_path):
-    path = tmp_path / "graph.npz"
-    first = graph_of(exact, path)
+    first = graph_of(exact, tmp_path, ALGORITHM_1)
+    path = tmp_path / FILES[0]
     before = (path.read_bytes(), path.stat().st_mtime_ns)
-    second = graph_of(exact, path, progress=never)
-    assert_equal_graphs(first, second)
-    assert_equal_graphs(first, localize_pairs(exact))
+    second = graph_of(exact, tmp_path, ALGORITHM_1, progress=never)
+    assert_equal_graphs(first.graph, second.graph)
+    assert_equal_graphs(first.graph, algorithm_1(exact))
+    assert first.pairs_tried == second.pairs_tried == 15
     for threshold in (0.01, 0.05, 0.5):
-        assert second.adjacency(threshold).sum() == 36
+        assert second.graph.adjacency(threshold).sum() == 30
     assert (path.read_bytes(), path.stat().st_mtime_ns) == before
+    assert [found.name for found in tmp_path.iterdir()] == FILES
+
+
+def test_a_graph_of_each_source_is_kept_beside_the_others(exact, tmp_path):
+    sources = ("matches", "tracks", "localize", "hybrid")
+    for edges in sources:
+        graph_of(exact, tmp_path, GraphOptions(edges=edges))
+    assert all(is_kept(exact, tmp_path, GraphOptions(edges=edges)) for edges in sources)
+    assert is_kept(exact, tmp_path, GraphOptions(edges="auto"))
+    assert {path.name for path in tmp_path.iterdir()} == {f"graph-{edges}.npz" for edges in sources}
 
 
 def test_a_graph_of_another_map_or_a_damaged_one_is_replaced(exact, tmp_path):
-    path = tmp_path / "graph.npz"
-    graph_of(exact_map(num_images=3), path)
-    expected = localize_pairs(exact)
-    assert_equal_graphs(graph_of(exact, path), expected)
+    graph_of(exact_map(num_images=3), tmp_path, ALGORITHM_1)
+    expected, path = algorithm_1(exact), tmp_path / FILES[0]
+    assert_equal_graphs(graph_of(exact, tmp_path, ALGORITHM_1).graph, expected)
     path.write_bytes(path.read_bytes()[:100])
-    assert_equal_graphs(graph_of(exact, path), expected)
-    assert_equal_graphs(graph_of(exact, path, progress=never), expected)
+    assert_equal_graphs(graph_of(exact, tmp_path, ALGORITHM_1).graph, expected)
+    assert_equal_graphs(graph_of(exact, tmp_path, ALGORITHM_1, progress=never).graph, expected)
     part = keep_images(exact, ["001.png", "004.png"])
-    assert graph_of(part, path).names == ("001.png", "004.png")
+    assert graph_of(part, tmp_path, ALGORITHM_1).graph.names == ("001.png", "004.png")
 
 
-def test_without_a_path_nothing_is_kept(exact, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    graph_of(exact, None)
-    assert list(tmp_path.iterdir()) == []
+def test_an_interruption_leaves_no_graph_but_its_progress(exact, tmp_path, monkeypatch):
+    monkeypatch.setattr(compute, "_BLOCK_SECONDS", 0.0)  # blocks of one pair
+    monkeypatch.setattr(compute, "_TRIAL", 2)
 
-
-def test_an_interruption_leaves_no_graph(exact, tmp_path):
     def interrupt(items, label):
         yield items[0]
         raise KeyboardInterrupt(label)
 
     with pytest.raises(KeyboardInterrupt):
-        graph_of(exact, tmp_path / "graph.npz", progress=interrupt)
-    assert list(tmp_path.iterdir()) == []
+        graph_of(exact, tmp_path, ALGORITHM_1, progress=interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["graph-localize.partial"]
+    labels = []
+
+    def watch(items, label):
+        labels.append(label)
+        return iter(items)
+
+    resumed = graph_of(exact, tmp_path, ALGORITHM_1, progress=watch)
+    left = 15 - (2 + 1) - 2  # the first run kept its trial and one block, and the second had a trial, too
+    assert labels == [f"localize {left} pairs from each other, 1 at a time"]
+    assert_equal_graphs(resumed.graph, algorithm_1(exact))
+    assert [path.name for path in tmp_path.iterdir()] == FILES
+
+
+CSV = "reference,query,error\n"
+
+
+def test_errors_of_another_system_are_read_from_a_table(exact, tmp_path):
+    path = tmp_path / "errors.csv"
+    path.write_text(CSV + "001.png,002.png,0.5\n002.png,001.png,0.0\n003.png,001.png,inf\n")
+    expected = np.full((6, 6), np.inf)
+    np.fill_diagonal(expected, 0)
+    expected[0, 1], expected[1, 0] = 0.5, 0.0
+    assert np.array_equal(read_given_graph(path, exact).dense(), expected)
+    path.write_text("\ufeffsource,error,query,reference\r\nx,0.25,001.png,006.png\r\n", encoding="utf-8")
+    assert read_given_graph(path, exact).dense()[5, 0] == 0.25
+    path.write_text(CSV)
+    assert read_given_graph(path, exact).errors.nnz == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has not the columns reference, query, error"),
+        ("reference,image,error\n001.png,002.png,0.1\n", "has not the columns reference, query, error"),
+        (CSV + "001.png,nobody.png,0.1\n", "'nobody.png' is no image of the map"),
+        (CSV + "001.png\n", "None is no image of the map"),
+        (CSV + "001.png,002.png\n", "not a readable table"),
+        (CSV + "001.png,002.png,small\n", "could not convert string to float: 'small'"),
+        (CSV + "001.png,002.png,nan\n", "errors must be numbers from 0 to infinity"),
+        (CSV + "001.png,002.png,-0.1\n", "errors must be numbers from 0 to infinity"),
+        (CSV + "001.png,002.png,0.1\n001.png,002.png,0.1\n", "pairs must not repeat"),
+        (CSV + "001.png,001.png,0.1\n", "pairs must be of two different images"),
+        (CSV + "001.png,\x00,0.1\n", "not a readable table|is no image of the map"),
+    ],
+)
+def test_a_bad_table_is_named(exact, tmp_path, text, message):
+    path = tmp_path / "errors.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_given_graph(path, exact)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("name", ["errors.csv", "errors.npz"])
+@pytest.mark.parametrize("kind", ["nothing", "another file", "folder"])
+def test_what_is_no_graph_is_named(exact, tmp_path, name, kind):
+    path = tmp_path / name
+    if kind == "another file":
+        path.write_bytes(b"\xff\xfe no graph")
+    if kind == "folder":
+        path.mkdir()
+    with pytest.raises(InputError) as caught:
+        read_given_graph(path, exact)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+SELF_PAIR = {"data": np.array([0.1]), "indices": np.array([1]), "indptr": np.array([0, 0, 1, 1, 1, 1, 1])}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"names": np.array(["a", "b", "c", "d", "e", "f"])},
+        {"data": np.array([np.nan])},
+        {"data": np.array([-1.0])},
+        {"indices": np.array([6])},
+        {"indices": np.array([-1])},
+        {"indptr": np.array([0, 1])},
+        SELF_PAIR,
+        {"data": np.ones(2), "indices": np.array([1, 1]), "indptr": np.array([0, 2, 2, 2, 2, 2, 2])},
+    ],
+    ids=["names", "nan", "negative", "beyond", "below", "rows", "self pair", "repeated pair"],
+)
+def test_a_bad_graph_of_another_system_is_named(exact, tmp_path, change):
+    good = {
+        "names": np.array(list(exact.images)),
+        "data": np.array([0.5]),
+        "indices": np.array([1]),
+        "indptr": np.array([0, 1, 1, 1, 1, 1, 1]),
+    }
+    path = tmp_path / "graph.npz"
+    np.savez(path, **good)
+    assert read_given_graph(path, exact).dense()[0, 1] == 0.5
+    np.savez(path, **{**good, **change})
+    with pytest.raises(InputError) as caught:
+        read_given_graph(path, exact)
+    assert str(caught.value).startswith(f"{path}: ")
+    for part in good:
+        np.savez(path, **{key: value for key, value in good.items() if key != part})
+        with pytest.raises(InputError):
+            read_given_graph(path, exact)
+
+
+@pytest.mark.parametrize(
+    ("edges", "ignored"),
+    [
+        ("matches", {"threshold": 0.1, "candidates": "all", "matching": NearestOptions(max_ratio=0.9)}),
+        ("tracks", {"threshold": 0.1, "candidates": "all", "matching": NearestOptions(max_ratio=0.9)}),
+        ("localize", {"threshold": 0.1}),
+        ("hybrid", {"candidates": "all"}),
+    ],
+)
+def test_a_graph_is_reused_when_only_options_change_that_its_source_ignores(exact, edges, ignored):
+    options = GraphOptions(edges=edges)
+    assert graph_key(exact, replace(options, **ignored)) == graph_key(exact, options)
+    changed = replace(options, ransac=RansacOptions(seed=1))
+    assert graph_key(exact, changed) != graph_key(exact, options)

@@ -10,6 +10,7 @@ COMMANDS = {
     "build": "photos -> map",
     "import": "COLMAP model, hloc output -> map",
     "info": "what is in a map",
+    "graph": "which reference images localize which others",
     "reduce": "map -> slim map",
     "localize": "poses of new images",
     "benchmark": "speed and accuracy, full against slim",
@@ -32,7 +33,9 @@ Commands: {commands}. Each explains itself with --help."""
 
 def main() -> None:
     """Run the command that the first argument names. Exit code 2 and one line say what a user can mend."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGTERM, signal.SIGALRM):
+        signal.signal(number, _interrupt)
+    sys.unraisablehook = _deliver_again
     sys.exit(run(sys.argv[1:]))
 
 
@@ -62,8 +65,9 @@ def run(arguments: list[str]) -> int:
         return _fail(str(error))
     except SystemExit as end:  # --help
         return int(end.code or 0)
-    except KeyboardInterrupt:
-        print("slimsfm: interrupted; nothing half-made was left behind", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        what_now = str(interruption) or "nothing half-made was left behind"
+        print(f"slimsfm: interrupted; {what_now}", file=sys.stderr)
         return 130
     return 0
 
@@ -78,6 +82,14 @@ def _take_signal_back() -> None:
     handler = signal.getsignal(signal.SIGTERM)
     if handler is not None and current_thread() is main_thread():
         signal.signal(signal.SIGTERM, handler)
+
+
+def _deliver_again(ignored: "sys.UnraisableHookArgs") -> None:
+    """Raise an interruption anew that fell into a destructor, where Python must ignore it."""
+    if issubclass(ignored.exc_type, KeyboardInterrupt):
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def _interrupt(_signum: int, _frame: FrameType | None) -> None:

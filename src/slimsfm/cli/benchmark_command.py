@@ -11,7 +11,9 @@ from slimsfm.datasets.images import hold_out, query_names
 from slimsfm.errors import InputError
 from slimsfm.evaluation.benchmark import BenchmarkOptions, benchmark
 from slimsfm.evaluation.protocol import Query, prepare
+from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import graph_of
+from slimsfm.graph.source import Edges
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
@@ -24,6 +26,7 @@ def benchmark_images(
     /,
     output: OutputPath,
     query_every: int = 3,
+    edges: Edges = "localize",
     comparison: Annotated[BenchmarkOptions, Flat] = BenchmarkOptions(),
     build: BuildOptions = BuildOptions(),
     keep_maps: Path | None = None,
@@ -36,6 +39,7 @@ def benchmark_images(
         images: Folder of photos.
         output: Folder for results.json and the pseudo-ground-truth model, which is reused where it exists.
         query_every: Every n-th image in order of name, from the first, is a query; the rest are references.
+        edges: How the reference graph is computed; the paper localizes each image from each other one.
         comparison: What is compared.
         build: How the pseudo ground truth is reconstructed.
         keep_maps: Keep the maps that are compared in this folder.
@@ -45,7 +49,7 @@ def benchmark_images(
     truth = _ground_truth(images, output / "pseudo-ground-truth", build)
     names = query_names(list(truth.images), query_every)
     references = hold_out(truth, names)
-    graph = graph_of(references, output / "graph.npz", progress=shown)
+    graph = graph_of(references, output, GraphOptions(edges=edges, candidates="all"), progress=shown).graph
     queries = [
         Query(path=images / n, camera=truth.camera(n), cam_from_world=truth.images[n].cam_from_world())
         for n in names

@@ -9,14 +9,14 @@ import tyro
 
 from slimsfm.cli.output import Stopwatch, console, finish, parse, print_rows
 from slimsfm.cli.results import maps_in, print_comparison, write_results
-from slimsfm.cli.synthesize_command import all_cores
 from slimsfm.datasets.mapping import map_object
 from slimsfm.datasets.onepose import ObjectSequences, PosedSequence
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.errors import OutputError
 from slimsfm.evaluation.benchmark import Benchmark, BenchmarkOptions, benchmark
 from slimsfm.evaluation.protocol import PreparedQuery, Query, errors_of, localize_all, prepare
-from slimsfm.graph import ReferenceGraph
+from slimsfm.execution import num_cores, processes
+from slimsfm.graph import GraphOptions, ReferenceGraph
 from slimsfm.graph.io import graph_of
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
@@ -26,6 +26,7 @@ from slimsfm.report import ObjectReport, QueryFrame, write_report
 
 _OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=40, query_frames=24)
 _COMPARISON = BenchmarkOptions()
+_GRAPH = GraphOptions(edges="localize", candidates="all")  # the paper's
 _FRAMES_SHOWN = 4
 
 
@@ -41,7 +42,7 @@ def demo(
     watch = Stopwatch()
     if output.exists() and any(output.iterdir() if output.is_dir() else [output]) and not overwrite:
         raise OutputError(f"{output}: exists already; choose another output or pass --overwrite")
-    with all_cores() as executor:
+    with processes(num_cores()) as executor:
         objects = synthesize(
             output / "objects", _OBJECTS, overwrite=overwrite, progress=shown, executor=executor
         )
@@ -66,7 +67,7 @@ def _measure(one: ObjectSequences, folder: Path) -> tuple[ReferenceGraph, Benchm
         made = map_object(one, Path(workspace), progress=shown)
         write_map(made.map, folder / "full-0", overwrite=True)
     full = read_map(folder / "full-0")
-    graph = graph_of(full, folder / "graph.npz", progress=shown)
+    graph = graph_of(full, folder / "full-0", _GRAPH, progress=shown).graph
     queries = prepare(full, queries_of(one.query), shown)
     result = benchmark(
         full, graph, queries, name=one.name, store=maps_in(folder), options=_COMPARISON, progress=shown

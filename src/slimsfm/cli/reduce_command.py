@@ -6,6 +6,7 @@ from typing import Annotated
 
 from rich.table import Table
 
+from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.output import (
     Flat,
     MapPath,
@@ -19,7 +20,9 @@ from slimsfm.cli.output import (
     size,
 )
 from slimsfm.errors import InputError
-from slimsfm.graph.io import graph_of
+from slimsfm.graph import GraphOptions, ReferenceGraph
+from slimsfm.graph.io import graph_of, read_given_graph
+from slimsfm.graph.source import Edges
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
@@ -34,6 +37,9 @@ def reduce(
     reduction: Annotated[ReductionOptions, Flat] = ReductionOptions(),
     images: tuple[str, ...] = (),
     random: int | None = None,
+    edges: Edges = "auto",
+    graph: Path | None = None,
+    execution: Annotated[Execution, Flat] = Execution(),
     overwrite: bool = False,
 ) -> None:
     """Keep a dominating set of a map's images, and the points they see.
@@ -44,6 +50,9 @@ def reduce(
         reduction: How images are chosen.
         images: Keep just these images instead.
         random: Keep this many images drawn at random instead (the paper's baseline).
+        edges: How the reference graph is computed; `slimsfm graph --help` explains each way.
+        graph: Errors of another system instead: .csv (reference, query, error) or .npz as of `slimsfm graph`.
+        execution: Where the graph is computed.
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
@@ -51,12 +60,20 @@ def reduce(
     if images and random is not None:
         raise InputError("--images and --random exclude each other")
     full = read_map(map)
+    if len(full.images) < 2:
+        raise InputError(f"{map}: has one image; there is nothing to reduce")
     if images:
         slim = keep_images(full, images)
     elif random is not None:
         slim = keep_random_images(full, random, seed=reduction.seed)
     else:
-        slim = _dominating(full, map, reduction)
+        options = GraphOptions(edges=edges, threshold=reduction.threshold)
+        if graph:
+            found = read_given_graph(graph, full)
+        else:
+            with resumable():
+                found = graph_of(full, map, options, execution.open_executor(), shown).graph
+        slim = _dominating(full, found, reduction)
     write_map(slim, output, overwrite=overwrite)
     _print_change(map, full, output, slim)
     finish(
@@ -64,10 +81,7 @@ def reduce(
     )
 
 
-def _dominating(full: Map, path: Path, options: ReductionOptions) -> Map:
-    if len(full.images) < 2:
-        raise InputError(f"{path}: has one image; there is nothing to reduce")
-    graph = graph_of(full, path / "graph.npz", progress=shown)
+def _dominating(full: Map, graph: ReferenceGraph, options: ReductionOptions) -> Map:
     reduced = reduce_map(full, graph, options)
     solution = reduced.solution
     proof = "proven smallest" if solution.is_optimal else f"at least {solution.lower_bound} are needed"

@@ -1,15 +1,11 @@
 """`slimsfm synthesize`."""
 
-import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
-from multiprocessing import get_context
-from os import sched_getaffinity
+from collections.abc import Sequence
 from typing import Annotated
 
 from slimsfm.cli.output import Flat, OutputPath, Stopwatch, finish, parse
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
+from slimsfm.execution import num_cores, processes
 from slimsfm.progress import shown
 
 
@@ -26,26 +22,12 @@ def synthesize_objects(
         overwrite: Replace objects that are there.
     """
     watch = Stopwatch()
-    with all_cores() as executor:
+    with processes(num_cores()) as executor:
         made = synthesize(output, synthesis, overwrite=overwrite, progress=shown, executor=executor)
     frames = sum(len(one.mapping.image_paths) + len(one.query.image_paths) for one in made)
     first = made[0].name
     what = f"{output}: {len(made)} objects, {frames} frames with exact poses"
     finish(what, watch, "build", output / first / f"{first}-1" / "color_full", "-o MAP")
-
-
-@contextmanager
-def all_cores() -> Iterator[Executor]:
-    """A process for each core, each started afresh; Ctrl-C is for this one to handle."""
-    ignore = (signal.SIGINT, signal.SIG_IGN)
-    with ProcessPoolExecutor(
-        len(sched_getaffinity(0)), get_context("spawn"), initializer=signal.signal, initargs=ignore
-    ) as executor:
-        try:
-            yield executor
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def main(arguments: Sequence[str]) -> None:

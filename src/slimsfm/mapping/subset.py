@@ -51,6 +51,9 @@ class Selection(Mapping[Key, Value]):
             raise KeyError(key)
         return self._source[key]
 
+    def __contains__(self, key: object) -> bool:
+        return key in self._keys
+
     def __iter__(self) -> Iterator[Key]:
         return iter(self._keys)
 

@@ -1,11 +1,13 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from scenes import exact_map
+from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
 from slimsfm.features import unit_rows
 from slimsfm.geometry import corner_error
-from slimsfm.graph import GraphOptions, ReferenceGraph, localize_pairs
+from slimsfm.graph import compute, compute_graph
 from slimsfm.mapping.subset import keep_images
 from slimsfm.pose import RansacOptions
 
@@ -19,10 +21,10 @@ def shared_points(map_):
 
 
 def test_where_everything_is_seen_everything_is_localized_without_error(exact):
-    graph = localize_pairs(exact)
+    graph = algorithm_1(exact)
     assert graph.names == tuple(exact.images)
-    assert graph.errors.max() < EXACT
-    assert np.array_equal(np.diag(graph.errors), np.zeros(6))
+    assert graph.dense().max() < EXACT
+    assert np.array_equal(np.diag(graph.dense()), np.zeros(6))
     assert graph.num_edges() == 6 * 5
 
 
@@ -30,12 +32,12 @@ def test_where_everything_is_seen_everything_is_localized_without_error(exact):
 def test_an_edge_is_where_enough_points_are_shared(reach_deg):
     map_ = exact_map(num_images=8, reach_deg=reach_deg)
     expected = shared_points(map_) >= RansacOptions().min_inliers
-    np.fill_diagonal(expected, True)
-    graph = localize_pairs(map_)
-    assert 8 < expected.sum() < 64
-    assert np.array_equal(graph.adjacency(), expected)
-    assert graph.errors[expected].max() < EXACT
-    assert np.all(np.isinf(graph.errors[~expected]))
+    np.fill_diagonal(expected, False)
+    graph = algorithm_1(map_)
+    assert 0 < expected.sum() < 56
+    assert np.array_equal(graph.adjacency().toarray(), expected)
+    assert graph.dense()[expected].max() < EXACT
+    assert np.all(np.isinf(graph.dense()[~expected & ~np.eye(8, dtype=bool)]))
 
 
 def test_an_edge_has_a_direction():
@@ -46,8 +48,8 @@ def test_an_edge_has_a_direction():
     for row in map_.images[blind].get_observation_point2D_idxs():
         map_.model.delete_observation(image_id, row)
     assert len(map_.observations[blind].rows) == 0
-    graph = localize_pairs(map_)
-    errors = dict(zip(graph.names, graph.errors, strict=True))
+    graph = algorithm_1(map_)
+    errors = dict(zip(graph.names, graph.dense(), strict=True))
     assert errors[seer][1] < EXACT
     assert np.isinf(errors[blind][0])
 
@@ -56,27 +58,28 @@ def test_a_graph_of_some_images_is_that_part_of_the_graph_of_all():
     map_ = exact_map(num_images=8, reach_deg=80.0)
     kept = [1, 2, 4, 7]
     names = list(map_.images)
-    part = localize_pairs(keep_images(map_, [names[i] for i in kept]))
-    assert np.array_equal(part.errors, localize_pairs(map_).errors[np.ix_(kept, kept)])
+    part = algorithm_1(keep_images(map_, [names[i] for i in kept]))
+    assert np.array_equal(part.dense(), algorithm_1(map_).dense()[np.ix_(kept, kept)])
 
 
 def test_the_options_reach_the_pose_search():
     map_ = exact_map(num_images=8, reach_deg=65.0)
     counts = shared_points(map_)
     needed = int(np.median(counts))
-    graph = localize_pairs(map_, GraphOptions(ransac=RansacOptions(min_inliers=needed)))
-    expected = (counts >= needed) | np.eye(8, dtype=bool)
-    assert np.array_equal(graph.adjacency(), expected)
+    graph = compute_graph(map_, replace(ALGORITHM_1, ransac=RansacOptions(min_inliers=needed))).graph
+    expected = (counts >= needed) & ~np.eye(8, dtype=bool)
+    assert np.array_equal(graph.adjacency().toarray(), expected)
 
 
 def test_a_threshold_is_exclusive_and_changes_only_the_decisions():
     errors = np.array([[0.0, 0.05, 0.02], [np.inf, 0.0, 0.0499], [0.3, 0.06, 0.0]])
-    graph = ReferenceGraph(names=("a", "b", "c"), errors=errors)
-    assert graph.adjacency().tolist() == [[1, 0, 1], [0, 1, 1], [0, 0, 1]]
+    graph = graph_from_dense(("a", "b", "c"), errors)
+    assert graph.adjacency().toarray().tolist() == [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
     assert [graph.num_edges(t) for t in (0.01, 0.02, 0.03, 0.05, 0.051, 0.1, 1.0)] == [0, 0, 1, 2, 3, 4, 5]
 
 
-def test_progress_sees_each_reference(exact):
+def test_progress_sees_each_block_of_work(exact, monkeypatch):
+    monkeypatch.setattr(compute, "_BLOCK_SECONDS", 0.0)  # blocks of one pair
     seen = []
 
     def watch(items, label):
@@ -84,8 +87,9 @@ def test_progress_sees_each_reference(exact):
             seen.append(label)
             yield item
 
-    localize_pairs(exact, progress=watch)
-    assert len(seen) == 6
+    compute_graph(exact, ALGORITHM_1, progress=watch)
+    untimed = 6 * 5 // 2 - compute._TRIAL
+    assert seen == [f"localize {untimed} pairs from each other, 1 at a time"] * untimed
 
 
 def opencv_matches(query, reference):
@@ -145,10 +149,10 @@ def test_decisions_agree_with_an_independent_computation_by_opencv(boulder):
     map_ = boulder.map
     names = list(map_.images)
     assert map_.shared_camera.model_name == "PINHOLE"
-    graph = localize_pairs(map_)
+    graph = algorithm_1(map_)
     errors = np.array([[0.0 if u == v else opencv_error(map_, u, v) for v in names] for u in names])
     off_diagonal = ~np.eye(len(names), dtype=bool)
-    agree = (graph.adjacency() == (errors < 0.05))[off_diagonal]
+    agree = (graph.adjacency().toarray() == (errors < 0.05))[off_diagonal]
     assert graph.num_edges() > 100
     assert agree.mean() >= 0.98
 

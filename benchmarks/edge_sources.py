@@ -1,0 +1,134 @@
+"""Sources of edges against localizing every image anew from every other: time, decisions, consequences.
+
+    python benchmarks/edge_sources.py ../shared/data/plush ../shared/data/fox -o /tmp/edge-sources
+
+Each folder of photos is reconstructed once and every third photo held out (as `slimsfm benchmark images`
+does, whose results in the same output are reused); two rendered objects are added. All sources work in this
+process on one thread, one after the other.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slimsfm.cli import run
+from slimsfm.datasets.images import hold_out, query_names
+from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.onepose import read_object
+from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
+from slimsfm.domination import DominationProblem, exact
+from slimsfm.evaluation.metrics import add_percent
+from slimsfm.evaluation.protocol import PreparedQuery, Query, errors_of, localize_all, prepare
+from slimsfm.graph import GraphOptions, GraphRun, compute_graph
+from slimsfm.graph.candidates import all_pairs, likely_pairs
+from slimsfm.mapping import Map, keep_images, read_map, write_map
+from slimsfm.progress import shown
+
+THRESHOLD = 0.05
+RENDERED = SynthesisOptions(objects=("printed_box", "boulder"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A map of references and queries that it knows nothing of."""
+
+    name: str
+    references: Map
+    queries: list[PreparedQuery]
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folders", nargs="*", type=Path)
+    parser.add_argument("-o", "--output", required=True, type=Path)
+    arguments = parser.parse_args()
+    for scene in scenes(arguments.folders, arguments.output):
+        compare(scene)
+
+
+def scenes(folders: list[Path], output: Path) -> Iterator[Scene]:
+    """The folders of photos, then the rendered objects."""
+    for folder in folders:
+        results = output / folder.name
+        if not (results / "pseudo-ground-truth").exists():
+            run(["benchmark", "images", str(folder), "-o", str(results), "--variants", "full"])
+        truth = read_map(results / "pseudo-ground-truth")
+        names = query_names(list(truth.images), 3)
+        queries = [
+            Query(
+                path=folder / name,
+                camera=truth.camera(name),
+                cam_from_world=truth.images[name].cam_from_world(),
+            )
+            for name in names
+        ]
+        references = hold_out(truth, names)
+        yield Scene(name=folder.name, references=references, queries=prepare(references, queries))
+    for name in RENDERED.objects:
+        yield rendered(name, output)
+
+
+def rendered(name: str, output: Path) -> Scene:
+    """A rendered object, mapped from its known poses."""
+    if not (output / "objects" / name).exists():
+        synthesize(output / "objects", SynthesisOptions(objects=(name,)), progress=shown)
+    made = read_object(output / "objects" / name)
+    with tempfile.TemporaryDirectory() as workspace:
+        built = map_object(made, Path(workspace), progress=shown).map
+        write_map(built, output / f"{name}-map", overwrite=True)
+    references = read_map(output / f"{name}-map")
+    queries = [
+        Query(path=path, camera=made.query.camera, cam_from_world=pose)
+        for path, pose in zip(made.query.image_paths, made.query.cam_from_world, strict=True)
+    ]
+    return Scene(name=name, references=references, queries=prepare(references, queries))
+
+
+def compare(scene: Scene) -> None:
+    """Compute the graph by each source and hold it against the paper's."""
+    everything = GraphOptions(edges="localize", candidates="all")
+    runs = {"localize": compute_graph(scene.references, everything, progress=shown)}
+    for edges in ("matches", "tracks", "hybrid"):
+        runs[edges] = compute_graph(scene.references, GraphOptions(edges=edges), progress=shown)
+    for edges, one in runs.items():
+        print(f"{scene.name}, {edges}: {describe(scene, one, runs['localize'])}")
+    print(f"{scene.name}, candidates: {pruning(scene.references, runs['localize'])}")
+
+
+def describe(scene: Scene, one: GraphRun, paper: GraphRun) -> str:
+    """Time, decisions and what the dominating set is good for."""
+    ours, theirs = (run.graph.dense() < THRESHOLD for run in (one, paper))
+    off = ~np.eye(len(ours), dtype=bool)
+    too_many = (ours & ~theirs & off).sum() / max((ours & off).sum(), 1)
+    chosen = exact(DominationProblem(one.graph.adjacency(THRESHOLD))).chosen
+    slim = keep_images(scene.references, [one.graph.names[i] for i in chosen])
+    errors = errors_of(slim, scene.queries, localize_all(slim, scene.queries, "exhaustive"))
+    return (
+        f"{seconds(one):.2f} s, {seconds(paper) / seconds(one):.1f} times faster than localize; "
+        f"{100 * (ours == theirs)[off].mean():.2f} % of decisions equal, {100 * too_many:.2f} % of edges "
+        f"too many; "
+        f"dominating set {len(chosen)}, ADD-0.1d {add_percent(errors, 0.1):.1f} %"
+    )
+
+
+def seconds(one: GraphRun) -> float:
+    """All stages."""
+    return sum(one.seconds.values())
+
+
+def pruning(map_: Map, paper: GraphRun) -> str:
+    """What trying only likely pairs costs."""
+    likely, everything = likely_pairs(map_), all_pairs(map_)
+    edges = paper.graph.dense() < THRESHOLD
+    kept = sum(int(edges[u, v]) + int(edges[v, u]) for u, v in likely)
+    share = 100 * kept / max(paper.graph.num_edges(THRESHOLD), 1)
+    return f"{len(likely)} of {len(everything)} pairs tried, {share:.2f} % of edges kept (target 99.5)"
+
+
+if __name__ == "__main__":
+    main()

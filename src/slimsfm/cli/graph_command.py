@@ -1,0 +1,88 @@
+"""`slimsfm graph`."""
+
+import json as json_format
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from slimsfm.cli.execution import Execution, resumable
+from slimsfm.cli.output import Flat, MapPath, Stopwatch, console, finish, parse
+from slimsfm.files import check_writable, replacing
+from slimsfm.graph import GraphOptions, GraphRun
+from slimsfm.graph.io import graph_of, write_graph
+from slimsfm.graph.recall import estimate_recall
+from slimsfm.graph.source import resolve
+from slimsfm.mapping.io import read_map
+from slimsfm.progress import shown
+
+
+def graph(
+    map: MapPath,
+    /,
+    edges: Annotated[GraphOptions, Flat] = GraphOptions(),
+    execution: Annotated[Execution, Flat] = Execution(),
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
+    json: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Find out which reference images localize which others.
+
+    The graph is kept in the map, and `reduce` uses it. After an interruption the same command goes on where
+    it stopped.
+
+    Args:
+        map: A map.
+        edges: How edges are found.
+        execution: Where the work is done.
+        output: Write the graph here as well, as npz.
+        json: Write the figures here.
+        overwrite: Replace what is there.
+    """
+    watch = Stopwatch()
+    for path in (output, json):
+        if path:
+            check_writable(path, overwrite=overwrite)
+    map_ = read_map(map)
+    with resumable():
+        run = graph_of(map_, map, edges, execution.open_executor(), shown)
+    figures = _figures(run, edges.threshold)
+    for name, value in figures.items():
+        console.print(f"{name:<20} {value}")
+    if resolve(map_, edges) == "localize" and edges.candidates == "likely":
+        share = estimate_recall(map_, run, edges)
+        console.print(f"{'recall':<20} {100 * share:.2f} % of the edges are on the pairs tried (estimated)")
+    if output:
+        write_graph(output, run.graph)
+    if json:
+        with replacing(json, overwrite=overwrite) as partial:
+            partial.write_text(json_format.dumps(figures, indent=2) + "\n")
+    finish(f"reference graph by {resolve(map_, edges)}", watch, "reduce", map, "-o", f"{map}-small")
+
+
+def _figures(run: GraphRun, threshold: float) -> dict:
+    found = run.graph
+    count, edges = len(found.names), found.num_edges(threshold)
+    out_degrees, in_degrees = found.degrees(threshold)
+    return {
+        "images": count,
+        "pairs_tried": run.pairs_tried,
+        "edges": edges,
+        "density": edges / max(count * (count - 1), 1),
+        "isolated": int(found.isolated(threshold).sum()),
+        "components": found.num_components(threshold),
+        "out_degree": _range(out_degrees),
+        "in_degree": _range(in_degrees),
+        "seconds": {stage: round(seconds, 4) for stage, seconds in run.seconds.items()},
+    }
+
+
+def _range(degrees: np.ndarray) -> dict[str, int | float]:
+    return {"min": int(degrees.min()), "median": float(np.median(degrees)), "max": int(degrees.max())}
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the command."""
+    parse(graph, arguments)
