@@ -14,7 +14,6 @@ from slimsfm.graph.source import GraphOptions, PairErrors, PairIndices, Referenc
 from slimsfm.mapping.map import Map
 
 _CACHED_IMAGES = 256
-_LEAST_MATCHES = 18  # a pose from fewer may fall on either side of the threshold: better one edge too few
 _MOST_MATCHES = 100  # that a pose is estimated from; they are verified, so more add hardly anything
 
 
@@ -42,9 +41,7 @@ class MatchEdges:
     def _error(self, reference: int, reference_rows: np.ndarray, query: int, query_rows: np.ndarray) -> float:
         points = self._points(reference)[reference_rows]
         sees = np.flatnonzero(points >= 0)
-        if len(sees) < _LEAST_MATCHES:
-            return np.inf
-        used = sees[:: -(-len(sees) // _MOST_MATCHES)]
+        used = sees[:: max(1, -(-len(sees) // _MOST_MATCHES))]
         return self._references.error(query, self._pixels(query, query_rows[used]), points[used])
 
     def _matches(self, u: int, v: int) -> Int64[np.ndarray, "n 2"]:
