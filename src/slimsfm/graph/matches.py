@@ -52,4 +52,4 @@ class MatchEdges:
 
     def _pixels(self, index: int, rows: Ids) -> Points2D:
         points2D = self._references.map.images[self._references.names[index]].points2D
-        return np.array([points2D[row].xy for row in rows.tolist()], np.float64)
+        return np.array([points2D[row].xy for row in rows.tolist()], np.float64).reshape(-1, 2)
