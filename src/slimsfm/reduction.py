@@ -60,9 +60,14 @@ def reduce_map(map: Map, graph: ReferenceGraph, options: ReductionOptions = Redu
     """
     if graph.names != tuple(map.images):
         raise ValueError("graph must be of this map, but its images are others")
-    problem = DominationProblem(graph.adjacency(options.threshold))
-    solution = SOLVERS[options.solver](problem, seed=options.seed)
+    solution = dominating_set(graph, options)
     return Reduction(map=keep_images(map, (graph.names[i] for i in solution.chosen)), solution=solution)
+
+
+def dominating_set(graph: ReferenceGraph, options: ReductionOptions) -> Solution:
+    """Choose the images that localize all others, by index into the graph's names."""
+    problem = DominationProblem(graph.adjacency(options.threshold))
+    return SOLVERS[options.solver](problem, seed=options.seed)
 
 
 def keep_random_images(map: Map, count: int, *, seed: int) -> Map:

@@ -12,8 +12,7 @@ from slimsfm.cli.output import (
     Stopwatch,
     check_output,
     console,
-    counts,
-    finish,
+    finish_map,
     parse,
 )
 from slimsfm.mapping.build import BuildOptions, build_map
@@ -45,11 +44,7 @@ def build_photos(
         console.print(f"left out, for they fit the model nowhere: {', '.join(made.left_out)}", style="yellow")
     box = made.map.box
     console.print(f"box {made.map.info.box_source}, diagonal {box.diagonal:.3g} ({made.map.info.unit} unit)")
-    parts = counts(made.map)
-    what = (
-        f"{output}: {parts['images']} images, {parts['points']} points, {parts['observations']} observations"
-    )
-    finish(what, watch, "reduce", output, "-o", f"{output}-small")
+    finish_map(made.map, output, watch)
 
 
 def main(arguments: Sequence[str]) -> None:

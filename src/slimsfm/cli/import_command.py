@@ -10,8 +10,7 @@ from slimsfm.cli.output import (
     Stopwatch,
     check_output,
     console,
-    counts,
-    finish,
+    finish_map,
     parse,
 )
 from slimsfm.mapping.importing import ImportOptions, import_model
@@ -39,11 +38,7 @@ def import_(
     made = import_model(model, source, progress=shown)
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")
-    parts = counts(made)
-    what = (
-        f"{output}: {parts['images']} images, {parts['points']} points, {parts['observations']} observations"
-    )
-    finish(what, watch, "reduce", output, "-o", f"{output}-small")
+    finish_map(made, output, watch)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -165,3 +165,9 @@ def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:
     console.print(f"{what} in {watch}")
     if next_command:
         console.print("next: slimsfm " + " ".join(str(word) for word in next_command), style="bold")
+
+
+def finish_map(made: Map, output: Path, watch: Stopwatch) -> None:
+    """Say what map was made, what it took, and that it can be reduced."""
+    parts = ", ".join(f"{number} {name}" for name, number in counts(made).items())
+    finish(f"{output}: {parts}", watch, "reduce", output, "-o", f"{output}-small")

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from slimsfm.domination import SOLVERS, DominationProblem, Solution
+from slimsfm.domination import Solution
 from slimsfm.evaluation.protocol import PreparedQuery, evaluate
 from slimsfm.evaluation.table import Row, mean_row
 from slimsfm.evaluation.variants import VARIANTS
@@ -11,7 +11,7 @@ from slimsfm.graph import ReferenceGraph
 from slimsfm.localization import STRATEGIES
 from slimsfm.mapping.map import Map
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction import ReductionOptions
+from slimsfm.reduction import ReductionOptions, dominating_set
 
 StoredMap = tuple[Map, int]
 """A map as read from disk, and its size there in bytes."""
@@ -68,8 +68,7 @@ def benchmark(
 
     The row of a variant in which chance plays a part is the mean over five draws.
     """
-    problem = DominationProblem(graph.adjacency(options.reduction.threshold))
-    solution = SOLVERS[options.reduction.solver](problem, seed=options.reduction.seed)
+    solution = dominating_set(graph, options.reduction)
     stored = {
         variant: [
             store(one, f"{variant}-{draw}") for draw, one in enumerate(VARIANTS[variant](map, solution))

@@ -86,7 +86,8 @@ def compute_graph(
     source = edge_source(map, options)
     pairs = _in_tiles(source.pairs())
     chosen = perf_counter()
-    errors = _solve_all(source, pairs, options, work, graph_key(map, options), progress)
+    key = graph_key(map, options) if work.checkpoint or work.open_executor else ""
+    errors = _solve_all(source, pairs, options, work, key, progress)
     solved = perf_counter()
     graph = _assemble(tuple(map.images), pairs, errors)
     seconds = {"candidates": chosen - start, "localize": solved - chosen, "assemble": perf_counter() - solved}

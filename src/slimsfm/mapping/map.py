@@ -1,5 +1,6 @@
 """The map: an SfM model, its local features and the object's box."""
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -106,6 +107,21 @@ class Map:
         points2D = image.points2D
         ids = np.array([points2D[row].point3D_id for row in rows], dtype=np.int64)
         return Observations(rows=rows, points=np.searchsorted(self.point3D_ids, ids))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Equal for maps of equal extractor, box, points, poses, cameras, observations and matched pairs."""
+        digest = hashlib.sha256(repr((self.info.extractor, self.info.extractor_options)).encode())
+        for values in (self.box.corners, self.point3D_ids, self.points3D_in_world):
+            digest.update(values.tobytes())
+        digest.update(repr(sorted(self.matches)).encode())
+        for name, image in self.images.items():
+            digest.update(name.encode())
+            digest.update(image.cam_from_world().matrix().tobytes())
+            digest.update(self.camera(name).model_name.encode() + self.camera(name).params.tobytes())
+            digest.update(self.observations[name].rows.tobytes())
+            digest.update(self.observations[name].points.tobytes())
+        return digest.hexdigest()
 
     @property
     def shared_camera(self) -> pycolmap.Camera | None:
