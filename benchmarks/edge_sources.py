@@ -22,7 +22,14 @@ from slimsfm.datasets.onepose import read_object
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.domination import DominationProblem, exact
 from slimsfm.evaluation.metrics import add_percent
-from slimsfm.evaluation.protocol import PreparedQuery, Query, errors_of, localize_all, prepare
+from slimsfm.evaluation.protocol import (
+    PreparedQuery,
+    errors_of,
+    held_out_queries,
+    localize_all,
+    prepare,
+    queries_of,
+)
 from slimsfm.graph import GraphOptions, GraphRun, compute_graph
 from slimsfm.graph.candidates import all_pairs, likely_pairs
 from slimsfm.mapping import Map, keep_images, read_map, write_map
@@ -59,14 +66,7 @@ def scenes(folders: list[Path], output: Path) -> Iterator[Scene]:
             run(["benchmark", "images", str(folder), "-o", str(results), "--variants", "full"])
         truth = read_map(results / "pseudo-ground-truth")
         names = query_names(list(truth.images), 3)
-        queries = [
-            Query(
-                path=folder / name,
-                camera=truth.camera(name),
-                cam_from_world=truth.images[name].cam_from_world(),
-            )
-            for name in names
-        ]
+        queries = held_out_queries(truth, folder, names)
         references = hold_out(truth, names)
         yield Scene(name=folder.name, references=references, queries=prepare(references, queries))
     for name in RENDERED.objects:
@@ -82,10 +82,7 @@ def rendered(name: str, output: Path) -> Scene:
         built = map_object(made, Path(workspace), progress=shown).map
         write_map(built, output / f"{name}-map", overwrite=True)
     references = read_map(output / f"{name}-map")
-    queries = [
-        Query(path=path, camera=made.query.camera, cam_from_world=pose)
-        for path, pose in zip(made.query.image_paths, made.query.cam_from_world, strict=True)
-    ]
+    queries = queries_of(made.query)
     return Scene(name=name, references=references, queries=prepare(references, queries))
 
 

@@ -10,7 +10,7 @@ from slimsfm.cli.results import maps_in, print_comparison, write_results
 from slimsfm.datasets.images import hold_out, query_names
 from slimsfm.errors import InputError
 from slimsfm.evaluation.benchmark import BenchmarkOptions, benchmark
-from slimsfm.evaluation.protocol import Query, prepare
+from slimsfm.evaluation.protocol import held_out_queries, prepare
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import graph_of
 from slimsfm.graph.source import Edges
@@ -50,10 +50,7 @@ def benchmark_images(
     names = query_names(list(truth.images), query_every)
     references = hold_out(truth, names)
     graph = graph_of(references, output, GraphOptions(edges=edges, candidates="all"), progress=shown).graph
-    queries = [
-        Query(path=images / n, camera=truth.camera(n), cam_from_world=truth.images[n].cam_from_world())
-        for n in names
-    ]
+    queries = held_out_queries(truth, images, names)
     prepared = prepare(references, queries, shown)
     with tempfile.TemporaryDirectory(prefix="slimsfm-benchmark-") as temporary:
         store = maps_in(keep_maps or Path(temporary))

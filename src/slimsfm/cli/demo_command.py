@@ -10,11 +10,11 @@ import tyro
 from slimsfm.cli.output import Stopwatch, console, finish, parse, print_rows
 from slimsfm.cli.results import maps_in, print_comparison, write_results
 from slimsfm.datasets.mapping import map_object
-from slimsfm.datasets.onepose import ObjectSequences, PosedSequence
+from slimsfm.datasets.onepose import ObjectSequences
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.errors import OutputError
 from slimsfm.evaluation.benchmark import Benchmark, BenchmarkOptions, benchmark
-from slimsfm.evaluation.protocol import PreparedQuery, Query, errors_of, localize_all, prepare
+from slimsfm.evaluation.protocol import PreparedQuery, errors_of, localize_all, prepare, queries_of
 from slimsfm.execution import num_cores, processes
 from slimsfm.graph import GraphOptions, ReferenceGraph
 from slimsfm.graph.io import graph_of
@@ -77,14 +77,6 @@ def _measure(one: ObjectSequences, folder: Path) -> tuple[ReferenceGraph, Benchm
         name=one.name, full=full, reduced=reduced, rows=result.rows, frames=_frames(reduced, queries)
     )
     return graph, result, report
-
-
-def queries_of(sequence: PosedSequence) -> list[Query]:
-    """The frames of a sequence as queries."""
-    return [
-        Query(path=path, camera=sequence.camera, cam_from_world=pose)
-        for path, pose in zip(sequence.image_paths, sequence.cam_from_world, strict=True)
-    ]
 
 
 def _frames(map: Map, queries: Sequence[PreparedQuery]) -> tuple[QueryFrame, ...]:

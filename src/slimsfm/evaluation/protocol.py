@@ -7,6 +7,7 @@ from time import perf_counter
 
 import pycolmap
 
+from slimsfm.datasets.onepose import PosedSequence
 from slimsfm.evaluation.metrics import PoseError, pose_error, score
 from slimsfm.evaluation.table import Row
 from slimsfm.features import Features, load_extractor
@@ -42,6 +43,26 @@ class PreparedQuery:
 
     extract_seconds: float
     """Time that took."""
+
+
+def queries_of(sequence: PosedSequence) -> list[Query]:
+    """The frames of a sequence as queries."""
+    return [
+        Query(path=path, camera=sequence.camera, cam_from_world=pose)
+        for path, pose in zip(sequence.image_paths, sequence.cam_from_world, strict=True)
+    ]
+
+
+def held_out_queries(truth: Map, images: Path, names: Sequence[str]) -> list[Query]:
+    """Images of a map, in a folder, as queries whose poses in the map are taken for true."""
+    return [
+        Query(
+            path=images / name,
+            camera=truth.camera(name),
+            cam_from_world=truth.images[name].cam_from_world(),
+        )
+        for name in names
+    ]
 
 
 def prepare(map: Map, queries: Sequence[Query], progress: ProgressBar = silent) -> list[PreparedQuery]:
