@@ -76,24 +76,33 @@ def test_a_chosen_node_must_be_in_the_graph(node):
         dominates(np.ones((2, 2)), [node])
 
 
-def test_a_solution_is_optimal_when_its_size_meets_the_bound():
-    assert Solution(chosen=(1, 4), lower_bound=2).is_optimal
-    assert Solution(chosen=(1, 4, 5), lower_bound=1).gap == 2
-    assert not Solution(chosen=(1, 4, 5), lower_bound=1).is_optimal
+def test_a_solution_is_optimal_when_its_cost_meets_the_bound():
+    assert Solution(chosen=(1, 4), cost=2, lower_bound=2).is_optimal
+    assert Solution(chosen=(1, 4, 5), cost=3, lower_bound=1).gap == 2
+    assert not Solution(chosen=(1, 4, 5), cost=3, lower_bound=1).is_optimal
+
+
+@pytest.mark.parametrize("value", ["unmet", "error"])
+def test_a_solution_is_optimal_only_if_all_that_was_asked_for_is(value):
+    more = {value: 2.0, f"{value}_bound": 1.0} if value == "error" else {value: 2, f"{value}_bound": 1}
+    assert not Solution(chosen=(1, 4), cost=2, lower_bound=2, **more).is_optimal
+    assert Solution(
+        chosen=(1, 4), cost=2, lower_bound=2, **{**more, value: more[f"{value}_bound"]}
+    ).is_optimal
+
+
+def test_how_long_a_search_took_takes_no_part_in_comparing_solutions():
+    fast, slow = (Solution(chosen=(1,), cost=1, lower_bound=1, seconds=s) for s in (0.1, 9.0))
+    assert fast == slow
 
 
 @pytest.mark.parametrize("chosen", [(2, 1), (1, 1)])
 def test_a_solution_out_of_order_is_refused(chosen):
     with pytest.raises(ValueError, match="chosen must be ascending"):
-        Solution(chosen=chosen, lower_bound=0)
+        Solution(chosen=chosen, cost=2, lower_bound=0)
 
 
 @pytest.mark.parametrize("lower_bound", [-1, 3])
 def test_an_impossible_lower_bound_is_refused(lower_bound):
     with pytest.raises(ValueError, match="lower_bound must be in"):
-        Solution(chosen=(0, 1), lower_bound=lower_bound)
-
-
-@pytest.mark.parametrize(("n", "bound"), [(1, 1), (4, 2), (5, 3)])
-def test_the_degree_bound_of_a_directed_cycle_is_half_its_nodes_rounded_up(n, bound):
-    assert DominationProblem(np.roll(np.eye(n), 1, axis=1)).degree_bound == bound
+        Solution(chosen=(0, 1), cost=2, lower_bound=lower_bound)

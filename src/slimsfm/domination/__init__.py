@@ -1,11 +1,18 @@
 """Minimum dominating sets of directed graphs: pure graph theory, which knows of no images."""
 
+from slimsfm.domination.cpsat import cpsat
 from slimsfm.domination.exact import exact
-from slimsfm.domination.problem import Adjacency, DominationProblem, Solution, Solver, dominates
+from slimsfm.domination.greedy import greedy
+from slimsfm.domination.order import cover_order
+from slimsfm.domination.parts import Adjacency
+from slimsfm.domination.problem import DominationProblem, dominates
 from slimsfm.domination.random_greedy import random_greedy
+from slimsfm.domination.solution import Solution, Solver
 
 SOLVERS: dict[str, Solver] = {
+    "cpsat": cpsat,
     "exact": exact,
+    "greedy": greedy,
     "random": random_greedy,
 }
 
@@ -15,7 +22,10 @@ __all__ = [
     "DominationProblem",
     "Solution",
     "Solver",
+    "cover_order",
+    "cpsat",
     "dominates",
     "exact",
+    "greedy",
     "random_greedy",
 ]

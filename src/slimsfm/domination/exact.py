@@ -1,32 +1,32 @@
-"""The smallest dominating set, by integer programming."""
-
-from math import ceil
+"""The best dominating set, by integer programming."""
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, OptimizeResult, milp
-from scipy.sparse import csc_array
+from scipy.optimize import Bounds, milp
 
-from slimsfm.domination.problem import DominationProblem, Solution
-from slimsfm.domination.random_greedy import random_greedy
-
-_BOUND_TOLERANCE = 1e-6
+from slimsfm.domination.problem import DominationProblem
+from slimsfm.domination.program import Minimum, Program
+from slimsfm.domination.solution import Solution
+from slimsfm.domination.stages import solve_in_stages
 
 
 def exact(problem: DominationProblem, *, time_limit_s: float = 60.0, seed: int = 0) -> Solution:
-    """Find a smallest dominating set of a directed graph and prove that none is smaller.
+    """Find a best dominating set of a directed graph and prove that none is better.
 
-    A set cover: minimize sum(x) over binary x such that the dominators of each node, itself among them, sum
-    up to 1 or more. HiGHS [2] solves it by branch and cut. The problem is NP-hard; view graphs [1] of some
+    A covering program: minimize the cost of binary x such that each node's requirement, a linear inequality,
+    is met. Data reduction and the split into components come first; HiGHS [2] solves what is left by branch
+    and cut. With a budget or errors there are further programs, one for each aim, with the earlier aims held;
+    the one for the errors is that of the p-median problem. The problem is NP-hard; view graphs [1] of some
     hundred images take seconds.
 
     Args:
-        problem: The graph.
-        time_limit_s: Seconds after which the search ends with the best set so far.
-        seed: Seed of `random_greedy`, which is asked when the time is up. Its draws come on top of the limit.
+        problem: What to meet.
+        time_limit_s: Seconds after which the search ends with the best set so far. What precedes the
+            programs, `greedy` included, takes part of it, but is not cut off.
+        seed: Seed of `greedy`, from whose set the search starts.
 
     Returns:
-        A smallest dominating set (`is_optimal`); or, if the time is up, the smaller of the search's and
-        `random_greedy`'s, the search's if equal, with the search's lower bound. Which of several smallest
+        A best set (`is_optimal`), up to 1e-6 in sums of costs or errors that are not whole numbers; or, if
+        the time is up, one that is no worse than `greedy`'s, with the search's bounds. Which of several best
         sets it is, HiGHS settles, a deterministic search; only one that the clock cuts off is not repeatable.
 
     Raises:
@@ -37,37 +37,20 @@ def exact(problem: DominationProblem, *, time_limit_s: float = 60.0, seed: int =
         [2] Huangfu and Hall, Parallelizing the dual revised simplex method, Mathematical Programming
             Computation 10, 2018.
     """
-    if not time_limit_s > 0:
-        raise ValueError(f"time_limit_s must be positive, got {time_limit_s}")
-    if problem.num_nodes == 0:
-        return Solution(chosen=(), lower_bound=0)
-    result = _solve_set_cover(problem, time_limit_s)
-    found = _incumbent(result)
-    bound = max(_integer_bound(result), problem.degree_bound)
-    if found is not None and len(found) == bound:
-        return Solution(chosen=found, lower_bound=bound)
-    drawn = random_greedy(problem, seed=seed).chosen
-    best = drawn if found is None or len(drawn) < len(found) else found
-    return Solution(chosen=best, lower_bound=bound)
+    return solve_in_stages(problem, _minimize, time_limit_s=time_limit_s, seed=seed)
 
 
-def _solve_set_cover(problem: DominationProblem, time_limit_s: float) -> OptimizeResult:
-    dominators = csc_array(problem.adjacency.T, dtype=np.float64)
-    return milp(
-        np.ones(problem.num_nodes),
-        integrality=np.ones(problem.num_nodes),
-        bounds=Bounds(0, 1),
-        constraints=LinearConstraint(dominators, lb=1),
-        options={"time_limit": time_limit_s, "mip_rel_gap": 0.0},
+def _minimize(program: Program, hint: np.ndarray, seconds: float) -> Minimum:  # noqa: ARG001 - milp takes none
+    if len(program.objective) == 0:
+        return Minimum(values=np.zeros(0), bound=0.0)
+    result = milp(
+        program.objective,
+        integrality=np.ones(len(program.objective)),
+        bounds=Bounds(*np.stack([program.least, program.most])),
+        constraints=(program.matrix.tocsc(), program.lower, np.inf),
+        options={"time_limit": seconds, "mip_rel_gap": 0.0},
     )
-
-
-def _incumbent(result: OptimizeResult) -> tuple[int, ...] | None:
-    """The best set found, or None when the time was up before there was one."""
-    return None if result.x is None else tuple(np.flatnonzero(result.x > 0.5).tolist())
-
-
-def _integer_bound(result: OptimizeResult) -> int:
-    """The dual bound, rounded up since sizes are whole numbers; 0 where there is none yet."""
-    bound = result.mip_dual_bound
-    return ceil(bound - _BOUND_TOLERANCE) if bound is not None and np.isfinite(bound) else 0
+    bound = result.fun if result.status == 0 else result.mip_dual_bound
+    return Minimum(
+        values=result.x, bound=float(bound) if bound is not None and np.isfinite(bound) else -np.inf
+    )

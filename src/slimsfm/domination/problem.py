@@ -1,31 +1,102 @@
-"""The minimum dominating set problem: its statement, its solutions and their checker."""
+"""The minimum dominating set problem: its statement and its checkers."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Protocol
+from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import csr_array, diags_array, vstack
 
-Adjacency = csr_array | np.ndarray
-"""Square matrix, row u the nodes that u dominates; what is not zero counts as true."""
+from slimsfm.arrays import Ids
+from slimsfm.domination import parts
+from slimsfm.domination.parts import Adjacency
+
+TOLERANCE = 1e-9
+"""Relative difference of two sums of costs or errors that counts as none."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class DominationProblem:
-    """A directed graph, of which the fewest nodes that dominate all others are sought.
+    """A directed graph, of which the cheapest nodes that dominate all others are sought.
+
+    A set D of nodes meets what node v asks for if v is in D, or if at least k nodes of D have an edge to v,
+    k being `dominators`: k-domination [1], for k = 1 that of [2]. Thus a node that could be chosen, but has
+    fewer than k in-neighbours that could, always is. A node forced out cannot be: it asks for k of them or,
+    where there are fewer, all; for nothing if there are none. A group asks for one of its nodes in D.
+
+    Without a budget all that is asked for must be met, at the least cost. With one, the sum of the costs
+    stays within it, and D is to meet as much as can be met, a group counting like a node; of sets that meet
+    equally much, a cheapest one is sought. With `errors`, of the cheapest sets one of least total error.
 
     Raises:
-        ValueError: `adjacency` is not square, not numeric or not finite.
+        ValueError: `adjacency` is not square, not numeric or not finite; `costs` are not one positive finite
+            number a node; `dominators` is below 1; `budget` is below the cost of the nodes forced in; a node
+            is forced that is not in the graph, or is forced both in and out; a group has no node that is
+            not forced out; or an edge has no error, or one that is negative or not finite.
+
+    References:
+        [1] Fink and Jacobson, n-domination in graphs, Graph Theory with Applications to Algorithms and
+            Computer Science, 1985.
+        [2] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set.
     """
 
     adjacency: csr_array
     """Boolean matrix in canonical CSR form: entry [u, v] is true when u dominates v. Whatever was given, its
     diagonal is true, since every node dominates itself."""
 
-    def __init__(self, adjacency: Adjacency) -> None:
-        object.__setattr__(self, "adjacency", _canonical(adjacency))
+    costs: np.ndarray
+    """What each node costs; all cost 1 where none are given."""
+
+    dominators: int
+    """How many chosen nodes dominate each node that is not chosen itself."""
+
+    budget: int | float | None
+    """The largest sum of costs, or None."""
+
+    forced_in: tuple[int, ...]
+    """Nodes that are chosen in any case, ascending."""
+
+    forced_out: tuple[int, ...]
+    """Nodes that may not be chosen, ascending; they are still to be dominated."""
+
+    groups: csr_array
+    """Boolean matrix; at least one node of each row is to be chosen."""
+
+    errors: csr_array | None
+    """Error of v as dominated by u on the entries of `adjacency`, 0 on the diagonal; or None."""
+
+    def __init__(
+        self,
+        adjacency: Adjacency,
+        *,
+        costs: np.ndarray | None = None,
+        dominators: int = 1,
+        budget: int | float | None = None,
+        forced_in: Iterable[int] = (),
+        forced_out: Iterable[int] = (),
+        groups: Adjacency | None = None,
+        errors: Adjacency | None = None,
+    ) -> None:
+        closed = parts.canonical_adjacency(adjacency)
+        n = len(closed.indptr) - 1
+        if dominators < 1:
+            raise ValueError(f"dominators must be at least 1, got {dominators}")
+        fields = {
+            "adjacency": closed,
+            "costs": parts.canonical_costs(costs, n),
+            "dominators": dominators,
+            "budget": budget,
+            "forced_in": parts.canonical_nodes("forced_in", forced_in, n),
+            "forced_out": parts.canonical_nodes("forced_out", forced_out, n),
+            "groups": parts.canonical_groups(groups, n),
+            "errors": None if errors is None else parts.canonical_errors(errors, closed),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        parts.check_forced(self.forced_in, self.forced_out, self.groups)
+        if budget is not None and not budget >= self.cost(self.forced_in):
+            forced = self.cost(self.forced_in)
+            raise ValueError(f"budget must be at least {forced}, the cost of forced_in, got {budget}")
 
     @property
     def num_nodes(self) -> int:
@@ -33,46 +104,87 @@ class DominationProblem:
         return len(self.adjacency.indptr) - 1
 
     @property
-    def degree_bound(self) -> int:
-        """Number of nodes over the most that one dominates, rounded up: no dominating set has fewer."""
-        if self.num_nodes == 0:
-            return 0
-        return -(-self.num_nodes // int(np.diff(self.adjacency.indptr).max()))
+    def whole_costs(self) -> bool:
+        """Whether all costs are whole numbers, as where none were given."""
+        return bool(np.all(self.costs == np.floor(self.costs)))
 
+    @cached_property
+    def requirements(self) -> tuple[csr_array, Ids]:
+        """What is asked for, as a covering problem: matrix A of whole numbers and vector b.
 
-@dataclass(frozen=True, kw_only=True)
-class Solution:
-    """A dominating set and how far it can be from the smallest."""
+        The set with indicator x meets requirement i if (A x)_i >= b_i. The first requirements are the nodes',
+        the last the groups'. Columns of nodes forced out are empty; b_i is 0 where nothing can be asked for.
+        """
+        out = np.zeros(self.num_nodes, dtype=bool)
+        out[list(self.forced_out)] = True
+        allowed = diags_array((~out).astype(np.int64), format="csr", dtype=np.int64)
+        identity = diags_array(np.ones(self.num_nodes), format="csr", dtype=np.int64)
+        others = csr_array((self.adjacency.astype(np.int64) - identity).T) @ allowed
+        available = np.asarray(others.sum(axis=1), dtype=np.int64).ravel()
+        needs = np.where(out, np.minimum(self.dominators, available), self.dominators)
+        own = diags_array(np.where(out, 0, needs), format="csr", dtype=np.int64)
+        grouped = csr_array(self.groups.astype(np.int64) @ allowed)
+        matrix = csr_array(vstack([others + own, grouped], format="csr"))
+        matrix.eliminate_zeros()
+        matrix.sort_indices()
+        return matrix, np.concatenate([needs, np.ones(len(grouped.indptr) - 1, dtype=np.int64)])
 
-    chosen: tuple[int, ...]
-    """The set's nodes, ascending."""
+    def cost(self, chosen: Iterable[int]) -> int | float:
+        """Sum of the costs of nodes; a whole number, as an int, where all costs are whole."""
+        total = float(self.costs[self._nodes(chosen)].sum())
+        return int(total) if self.whole_costs else total
 
-    lower_bound: int
-    """No dominating set of the graph has fewer nodes; this is proven."""
+    def num_unmet(self, chosen: Iterable[int]) -> int:
+        """How many nodes and groups lack what they ask for under a chosen set without nodes forced out.
 
-    def __post_init__(self) -> None:
-        if any(u >= v for u, v in pairwise(self.chosen)):
-            raise ValueError(f"chosen must be ascending and distinct, got {self.chosen}")
-        if not 0 <= self.lower_bound <= len(self.chosen):
-            raise ValueError(f"lower_bound must be in [0, {len(self.chosen)}], got {self.lower_bound}")
+        Raises:
+            ValueError: `chosen` has a node that is not in the graph.
+        """
+        return int((~self._met(self._nodes(chosen))).sum())
 
-    @property
-    def gap(self) -> int:
-        """How many nodes the smallest dominating set may have less, at most."""
-        return len(self.chosen) - self.lower_bound
+    def total_error(self, chosen: Iterable[int]) -> float:
+        """Sum of the errors of the nodes that are not chosen and have what they ask for.
 
-    @property
-    def is_optimal(self) -> bool:
-        """Whether the set is proven to be of the smallest size."""
-        return self.gap == 0
+        Each counts with the least error from a chosen node. The sum is 0 where the problem has no errors.
 
+        Raises:
+            ValueError: `chosen` has a node that is not in the graph.
+        """
+        nodes = self._nodes(chosen)
+        if self.errors is None:
+            return 0.0
+        best = np.full(self.num_nodes, np.inf)
+        reached = self.errors[nodes]
+        np.minimum.at(best, reached.indices, reached.data)
+        counted = self._met(nodes)[: self.num_nodes] & np.isfinite(best)
+        return float(best[counted].sum())
 
-class Solver(Protocol):
-    """A method for the minimum dominating set: all take these arguments, their own ones have defaults."""
+    def satisfies(self, chosen: Iterable[int]) -> bool:
+        """Check whether a chosen set keeps to all parts of the problem.
 
-    def __call__(self, problem: DominationProblem, *, seed: int = 0) -> Solution:
-        """Find a dominating set; `seed` settles what is left to chance."""
-        ...
+        It has the nodes forced in and none forced out and, without a budget, meets all that is asked for;
+        with one, its cost is within the budget. How good it is beyond that, `num_unmet`, `cost` and
+        `total_error` say, in this order.
+
+        Raises:
+            ValueError: `chosen` has a node that is not in the graph.
+        """
+        chosen = parts.canonical_nodes("chosen", chosen, self.num_nodes)
+        members = set(chosen)
+        if not members.issuperset(self.forced_in) or not members.isdisjoint(self.forced_out):
+            return False
+        if self.budget is None:
+            return self.num_unmet(chosen) == 0
+        return self.cost(chosen) <= self.budget * (1 + TOLERANCE)
+
+    def _met(self, nodes: Ids) -> np.ndarray:
+        matrix, needs = self.requirements
+        indicator = np.zeros(self.num_nodes, dtype=np.int64)
+        indicator[nodes] = 1
+        return matrix @ indicator >= needs
+
+    def _nodes(self, chosen: Iterable[int]) -> Ids:
+        return np.array(parts.canonical_nodes("chosen", chosen, self.num_nodes), dtype=np.int64)
 
 
 def dominates(adjacency: Adjacency, chosen: Iterable[int]) -> bool:
@@ -97,24 +209,7 @@ def dominates(adjacency: Adjacency, chosen: Iterable[int]) -> bool:
         [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set.
     """
     problem = DominationProblem(adjacency)
-    nodes = np.array(list(chosen), dtype=np.int64)
-    if np.any((nodes < 0) | (nodes >= problem.num_nodes)):
-        raise ValueError(f"chosen must be nodes in [0, {problem.num_nodes}), got {nodes.tolist()}")
+    nodes = list(parts.canonical_nodes("chosen", chosen, problem.num_nodes))
     dominated = np.zeros(problem.num_nodes, dtype=bool)
     dominated[problem.adjacency[nodes].indices] = True
     return bool(dominated.all())
-
-
-def _canonical(adjacency: Adjacency) -> csr_array:
-    shape = tuple(adjacency.shape or ())
-    if len(shape) != 2 or shape[0] != shape[1]:
-        raise ValueError(f"adjacency must be a square matrix, got shape {shape}")
-    if adjacency.dtype.kind not in "biuf":
-        raise ValueError(f"adjacency must be boolean or real, got {adjacency.dtype}")
-    values = csr_array(adjacency)
-    if not np.all(np.isfinite(values.data)):
-        raise ValueError("adjacency must be finite, got NaN or infinity")
-    closed = csr_array(values.astype(bool) + eye_array(shape[0], dtype=bool, format="csr"))
-    closed.sum_duplicates()
-    closed.eliminate_zeros()
-    return closed

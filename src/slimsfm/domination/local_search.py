@@ -1,0 +1,157 @@
+"""Local search on covers: swaps that weights on the rows lead out of dead ends."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slimsfm.domination.cover import Columns, Cover, Rows
+
+
+@dataclass(kw_only=True, eq=False)
+class _State:
+    """A choice of columns with, for each column, the weighted value that it adds, or would add."""
+
+    cover: Cover
+    covered: Rows
+    chosen: np.ndarray
+    scores: np.ndarray
+    weights: np.ndarray
+    changed: Columns
+    """When each column was last chosen or left out."""
+    cost: int | float = 0.0
+    time: int = 0
+    banned: set[int] = field(default_factory=set)
+    """Columns just left out: not to be chosen again at once."""
+
+    def entries(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Column, row and value of all entries of some rows."""
+        starts = self.cover.matrix.indptr[rows]
+        lengths = self.cover.matrix.indptr[rows + 1] - starts
+        place = np.repeat(starts - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
+        place += np.arange(len(place))
+        of_entry = np.repeat(rows, lengths)
+        return self.cover.matrix.indices[place], of_entry, self.cover.matrix.data[place]
+
+    def values(self, columns: np.ndarray, rows: np.ndarray, data: np.ndarray) -> np.ndarray:
+        """What the entries add to their rows, capped at the needs: to be lost if chosen, else to be won."""
+        needs, covered = self.cover.needs[rows], self.covered[rows]
+        without = np.where(self.chosen[columns], covered - data, covered)
+        return np.minimum(without + data, needs) - np.minimum(without, needs)
+
+    def flip(self, column: int) -> None:
+        """Choose a column, or leave it out."""
+        rows, data = self.cover.rows_of(column)
+        sign = -1 if self.chosen[column] else 1
+        before = self.covered[rows]
+        needs = self.cover.needs[rows]
+        matters = np.minimum(before, before + sign * data) < 2 * needs
+        near = self.entries(rows[matters])
+        old = self.values(*near)
+        self.covered[rows] = before + sign * data
+        self.chosen[column] = not self.chosen[column]
+        np.add.at(self.scores, near[0], self.weights[near[1]] * (self.values(*near) - old))
+        self.cost += sign * float(self.cover.costs[column])
+        self.changed[column] = self.time
+
+    def unmet(self) -> np.ndarray:
+        """Rows that lack something."""
+        return np.flatnonzero(self.covered < self.cover.needs)
+
+    def weigh(self, rows: np.ndarray) -> None:
+        """Let rows that stay unmet count for more."""
+        self.weights[rows] += 1
+        near = self.entries(rows)
+        np.add.at(self.scores, near[0], self.values(*near))
+
+    def cheapest_loss(self) -> int:
+        """The chosen column whose value for its cost is least, of equal ones the longest chosen."""
+        columns = np.flatnonzero(self.chosen)
+        ratios = self.scores[columns] / self.cover.costs[columns]
+        best = columns[ratios == ratios.min()]
+        return int(best[np.argmin(self.changed[best])])
+
+    def best_gain(self, row: int, room: int | float) -> int | None:
+        """The column of a row that adds the most for its cost, of those that fit and are not banned."""
+        part = slice(self.cover.matrix.indptr[row], self.cover.matrix.indptr[row + 1])
+        columns = self.cover.matrix.indices[part]
+        fits = ~self.chosen[columns] & (self.cover.costs[columns] <= room)
+        columns = np.array([c for c in columns[fits].tolist() if c not in self.banned], dtype=np.int64)
+        if len(columns) == 0:
+            return None
+        ratios = self.scores[columns] / self.cover.costs[columns]
+        best = columns[ratios == ratios.max()]
+        return int(best[np.argmin(self.changed[best])])
+
+
+def improved(cover: Cover, chosen: list[int], *, bound: int | float, steps: int, seed: int) -> list[int]:
+    """Look for a better choice than a given one by weighted swaps [1].
+
+    Once all rows are met, a cheaper choice is asked for: columns are left out until it is one. Then each step
+    leaves out the column whose loss costs the least, chooses the best one of an unmet row drawn at random
+    while it fits into the cost, and adds 1 to the weight of the rows still unmet.
+
+    Args:
+        cover: The rows to meet, within its budget if it has one.
+        chosen: A choice to start from, within the budget; without one it meets all rows.
+        bound: A cost that no choice meeting all rows falls below; the search ends when it is reached.
+        steps: How many swaps to try.
+        seed: Equal arguments give equal results.
+
+    Returns:
+        The best choice seen, ascending: with fewest unmet rows, then the cheapest.
+
+    References:
+        [1] Gao, Weise and Li, An efficient local search heuristic with row weighting for the unicost set
+            covering problem, European Journal of Operational Research 246, 2015.
+    """
+    rng = np.random.default_rng(seed)
+    state = _start(cover, chosen)
+    best, best_merit = sorted(chosen), (len(state.unmet()), state.cost)
+    limit = cover.budget * (1 + 1e-12)
+    for step in range(steps):
+        unmet = state.unmet()
+        if (len(unmet), state.cost) < best_merit:
+            best, best_merit = np.flatnonzero(state.chosen).tolist(), (len(unmet), state.cost)
+        if len(unmet) == 0:
+            limit = min(limit, state.cost * (1 - 1e-9))
+        proven = best_merit[0] == 0 and best_merit[1] - bound < 1e-9 * best_merit[1]
+        if proven or not state.chosen.any():
+            break
+        state.time = step + 1
+        _swap(state, limit, rng)
+    return best
+
+
+def _swap(state: _State, limit: int | float, rng: np.random.Generator) -> None:
+    state.banned.clear()
+    while True:
+        column = state.cheapest_loss()
+        state.flip(column)
+        state.banned.add(column)
+        if state.cost <= limit or not state.chosen.any():
+            break
+    unmet = state.unmet()
+    while len(unmet) > 0:
+        column = state.best_gain(int(unmet[rng.integers(len(unmet))]), limit - state.cost)
+        if column is None:
+            break
+        state.flip(column)
+        unmet = state.unmet()
+    state.weigh(unmet)
+
+
+def _start(cover: Cover, chosen: list[int]) -> _State:
+    m, n = len(cover.needs), len(cover.costs)
+    state = _State(
+        cover=cover,
+        covered=cover.covered(chosen),
+        chosen=np.zeros(n, dtype=bool),
+        scores=np.zeros(n),
+        weights=np.ones(m),
+        changed=np.zeros(n, dtype=np.int64),
+        cost=float(cover.costs[chosen].sum()),
+    )
+    state.chosen[chosen] = True
+    columns, rows, data = state.entries(np.arange(m))
+    np.add.at(state.scores, columns, state.values(columns, rows, data).astype(float))
+    return state

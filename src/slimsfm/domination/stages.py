@@ -1,0 +1,165 @@
+"""How solvers of integer programs find best sets: aim by aim, component by component."""
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from scipy.optimize import linprog
+from scipy.sparse import csr_array
+
+from slimsfm.domination.cover import Cover, components, cover_of, split
+from slimsfm.domination.greedy import LARGE, greedy, greedy_parts, part_bound
+from slimsfm.domination.kernel import reduced
+from slimsfm.domination.problem import DominationProblem
+from slimsfm.domination.program import Minimizer, Minimum, Program, covering_program
+from slimsfm.domination.solution import Bounds, Solution, merit, rounded_up, solution_of
+from slimsfm.domination.staged import StagedProgram, error_program, staged_program
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """A problem, who minimizes its programs, and until when."""
+
+    problem: DominationProblem
+    minimize: Minimizer
+    deadline: float
+    seed: int
+    effort: int
+
+    def minimum(self, program: Program, hint: np.ndarray) -> Minimum:
+        """The minimum, or what is known of it when the time is up."""
+        seconds = self.deadline - perf_counter()
+        if seconds <= 0:
+            return Minimum(values=None, bound=-np.inf)
+        return self.minimize(program, hint, seconds)
+
+    def relaxation(self, program: Program) -> int | float:
+        """The least objective over the reals: a bound that the search over 0 and 1 may be slow to find."""
+        result = linprog(
+            program.objective,
+            A_ub=-program.matrix.tocsc(),
+            b_ub=-program.lower,
+            bounds=np.stack([program.least, program.most], axis=1),
+            method="highs-ipm",
+            options={"time_limit": max(self.deadline - perf_counter(), 1e-3)},
+        )
+        return float(result.fun) if result.status == 0 else 0.0
+
+    def best(self, *sets: tuple[int, ...]) -> tuple[int, ...]:
+        """The best of some sets, of which one or more keep to the problem; the first of equal ones."""
+        kept = [chosen for chosen in dict.fromkeys(sets) if self.problem.satisfies(chosen)]
+        return min(kept, key=lambda chosen: merit(self.problem, chosen))
+
+
+def solve_in_stages(
+    problem: DominationProblem, minimize: Minimizer, *, time_limit_s: float, seed: int, effort: int = 1
+) -> Solution:
+    """Minimize what is left unmet, then the cost, then the error, each with the earlier ones held.
+
+    Starts from `greedy`'s choices and never ends with a worse one. Without a budget there is nothing to leave
+    unmet, and costs are minimized on the reduced problem, component by component.
+
+    Raises:
+        ValueError: `time_limit_s` is not positive.
+    """
+    if not time_limit_s > 0:
+        raise ValueError(f"time_limit_s must be positive, got {time_limit_s}")
+    start = perf_counter()
+    search = _Search(
+        problem=problem, minimize=minimize, deadline=start + time_limit_s, seed=seed, effort=effort
+    )
+    chosen, bounds = _cheapest(search) if problem.budget is None else _most_met(search)
+    found = solution_of(problem, chosen, bounds, start)
+    if problem.errors is None or found.unmet > found.unmet_bound or found.gap > 0:
+        return found
+    chosen, error_bound = _least_error(search, problem.errors, chosen)
+    bounds = Bounds(unmet=bounds.unmet, cost=bounds.cost, error=error_bound)
+    return solution_of(problem, chosen, bounds, start)
+
+
+def _cheapest(search: _Search) -> tuple[tuple[int, ...], Bounds]:
+    problem = search.problem
+    kernel = reduced(cover_of(problem))
+    picked = [*problem.forced_in, *kernel.chosen]
+    bound = problem.cost(picked)
+    pieces = sorted(split(kernel.cover), key=lambda piece: piece.matrix.nnz)
+    hints = greedy_parts(pieces, seed=search.seed, effort=search.effort)
+    for piece, hint in zip(pieces, hints, strict=True):
+        part, least = _cheapest_part(search, piece, hint)
+        picked += part
+        bound += least
+    sets = [tuple(sorted(picked))]
+    if problem.errors is not None:
+        sets.append(greedy(problem, seed=search.seed).chosen)
+    return search.best(*sets), Bounds(cost=bound)
+
+
+def _cheapest_part(search: _Search, piece: Cover, hint: list[int]) -> tuple[list[int], int | float]:
+    """The cheapest choice found for a piece, and a bound on what any costs."""
+    whole = search.problem.whole_costs
+    bound, cost = part_bound(piece, whole=whole), float(piece.costs[hint].sum())
+    if bound >= cost:
+        return hint, bound
+    columns, program = piece.candidates, covering_program(piece)
+    relaxed = search.relaxation(program) if len(piece.needs) > LARGE else 0.0
+    found = search.minimum(program, np.isin(columns, hint))
+    least = max(relaxed, found.bound)
+    bound = max(bound, rounded_up(least) if whole else least)
+    if found.values is None:
+        return hint, bound
+    part = columns[found.values > 0.5].tolist()
+    meets = bool(np.all(piece.covered(part) >= piece.needs))
+    return (part if meets and piece.costs[part].sum() < cost else hint), bound
+
+
+def _most_met(search: _Search) -> tuple[tuple[int, ...], Bounds]:
+    problem = search.problem
+    known = greedy(problem, seed=search.seed).chosen
+    staged = staged_program(problem, np.arange(len(problem.requirements[1])))
+    chosen, least = _improved(search, staged, staged.program.aiming_at(staged.unmet), known)
+    unmet_bound = max(0, rounded_up(least + len(staged.rows)))
+    if problem.num_unmet(chosen) > unmet_bound:
+        return chosen, Bounds(unmet=unmet_bound, cost=problem.cost(problem.forced_in))
+    held = staged.program.aiming_at(staged.unmet).holding(unmet_bound - len(staged.rows))
+    chosen, least = _improved(search, staged, held.aiming_at(staged.cost), chosen)
+    return chosen, Bounds(unmet=unmet_bound, cost=max(least, problem.cost(problem.forced_in)))
+
+
+def _least_error(
+    search: _Search, errors: csr_array, chosen: tuple[int, ...]
+) -> tuple[tuple[int, ...], int | float]:
+    """The set of least total error found among those of equal cost that meet as much, and a bound on it."""
+    problem = search.problem
+    rows = np.arange(len(problem.requirements[1]))
+    parts = components(problem.requirements[0]) if problem.budget is None else [rows]
+    total = 0.0
+    for part in [part for part in parts if len(part) > 1]:
+        staged = staged_program(problem, part)
+        held = _held(problem, staged, chosen)
+        program = error_program(problem, errors, staged, held)
+        chosen, bound = _improved(search, staged, program, chosen)
+        total += max(0.0, bound)
+    return chosen, total
+
+
+def _held(problem: DominationProblem, staged: StagedProgram, chosen: tuple[int, ...]) -> Program:
+    """The staged program with number met and cost held at those of a set."""
+    cost = float(staged.cost[: len(staged.nodes)] @ np.isin(staged.nodes, chosen))
+    program = staged.program.aiming_at(staged.cost).holding(cost)
+    if problem.budget is None:
+        return program
+    met = len(staged.rows) - problem.num_unmet(chosen)
+    return program.aiming_at(staged.unmet).holding(-met)
+
+
+def _improved(
+    search: _Search, staged: StagedProgram, program: Program, chosen: tuple[int, ...]
+) -> tuple[tuple[int, ...], int | float]:
+    """A set, or a better one with the part's nodes as a program's minimum has them; and its bound."""
+    hint = np.isin(staged.nodes, chosen)
+    found = search.minimum(program, hint)
+    if found.values is None:
+        return chosen, found.bound
+    part = staged.nodes[found.values[: len(staged.nodes)] > 0.5]
+    others = sorted(set(chosen) - set(staged.nodes.tolist()))
+    return search.best(chosen, tuple(sorted([*others, *part.tolist()]))), found.bound
