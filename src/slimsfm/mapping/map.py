@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 
-from slimsfm.arrays import Ids, IndexPairs, Points3D
+from slimsfm.arrays import Descriptors, Ids, IndexPairs, Points3D
 from slimsfm.errors import MapError
 from slimsfm.features import Features
 from slimsfm.geometry import Box
@@ -50,6 +50,17 @@ class Observations:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class PointDescriptors:
+    """Points of a map that queries are matched against directly, each with one descriptor."""
+
+    points: Ids
+    """Rows of the points in `Map.points3D_in_world`, ascending."""
+
+    descriptors: Descriptors
+    """For each of them its descriptor."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Map:
     """Everything that a query is localized against. Nothing in it changes."""
 
@@ -57,7 +68,11 @@ class Map:
     """The SfM model; keypoint i of an image is row i of its features."""
 
     features: Mapping[str, Features]
-    """Local features by image name; may be read from disk on access."""
+    """Local features by image name; may be read from disk on access. Empty in a map for direct matching
+    alone: its images have poses but no keypoints, its points no tracks."""
+
+    point_descriptors: PointDescriptors | None = None
+    """What queries are matched against directly; None where it has to be made from `features`."""
 
     matches: Mapping[tuple[str, str], IndexPairs] = field(default_factory=dict)
     """Verified matches by pair of image names; empty where the map has none."""
@@ -140,9 +155,24 @@ def check_map(map: Map) -> None:
         raise MapError(
             f"the map has {len(map.images)} images and {len(map.point3D_ids)} points; it needs both"
         )
+    if not map.features and map.point_descriptors is not None:
+        return
     for name in map.images:
         if name not in map.features:
             raise MapError(f"the map has no features of its image {name!r}")
+
+
+def check_has_features(map: Map) -> None:
+    """Make sure that images can be matched with those of a map.
+
+    Raises:
+        MapError: The map was made for direct matching alone.
+    """
+    if not map.features and map.point_descriptors is not None:
+        raise MapError(
+            "the map is for direct matching alone: it holds points but no image features; "
+            "use the map that it was made of"
+        )
 
 
 def check_count(image: pycolmap.Image, count: int) -> None:

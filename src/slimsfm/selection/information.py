@@ -1,0 +1,146 @@
+"""Our selector: K-cover in which a use counts for more the more it says of its image's pose.
+
+A use of a point by an image, with twist J, adds the information J'J to the image's pose. Its worth is
+1 + w log det(I + J C J') where C is the covariance of the pose given the points chosen so far: one match
+more for the image, and what that match tells, which is little where the chosen points lie already. Points
+are chosen greedily by the worth of all their uses in images that are not satisfied yet. An image is satisfied
+when it can use K of the chosen points, or all it has if those are fewer, and its predicted corner error is as
+small as K points drawn at random from its own would make it: the target follows what the full map can do.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64
+
+from slimsfm.arrays import Ids
+from slimsfm.selection.lazy import Gains, greedy_order
+from slimsfm.selection.problem import (
+    PRIOR_SIGMA,
+    SelectionProblem,
+    Twists,
+    check_count,
+    corner_errors,
+    most_cover,
+)
+
+_WEIGHT = 0.5  # of what a match tells against that it is a match
+_FIRST_COVER = 8  # points an image
+_GROWTH = 1.25  # from one K to the next
+
+
+def information(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:  # noqa: ARG001
+    """Choose the points that determine the poses of all images best.
+
+    The largest K of 8, 10, 13, ... is taken at which `count` points satisfy all images; what is left of the
+    budget goes towards the next K. Nothing is left to chance.
+
+    Args:
+        problem: The points and who can use them.
+        count: How many points are wanted.
+        seed: Unused.
+
+    Returns:
+        Points in the order of their choice.
+
+    Raises:
+        ValueError: `count` is not positive.
+
+    Notes:
+        A round evaluates every use once at first, and after that gains, which never rise, lazily: some
+        hundred for each choice in practice. O(log log(points an image)) rounds for one budget; a round that
+        exceeds it is broken off.
+    """
+    check_count(count)
+    covers = _covers(problem)
+    choice = _Choice(problem)
+    low, high = 0, max(bisect_right(covers, most_cover(problem, count)) - 1, 0)
+    while low < high:
+        middle = (low + high + 1) // 2
+        tried = _Choice(problem)
+        if tried.extend(covers[middle], count + 1) <= count:
+            low, choice = middle, tried
+        else:
+            high = middle - 1
+    for cover in covers[low:]:
+        if choice.extend(cover, count) >= count:
+            break
+    return np.array(choice.chosen, np.int64)
+
+
+def _covers(problem: SelectionProblem) -> list[int]:
+    """The values of K to try; the last asks for every point that an image can use."""
+    most = int(problem.points_an_image.max(initial=1))
+    covers = [_FIRST_COVER]
+    while covers[-1] < most:
+        covers.append(min(int(np.ceil(covers[-1] * _GROWTH)), most))
+    return covers
+
+
+class _Choice:
+    """The points chosen so far and what they do for each image."""
+
+    def __init__(self, problem: SelectionProblem) -> None:
+        self.chosen: list[int] = []
+        self._problem = problem
+        self._of = problem.images_of
+        self._twists = problem.twists
+        self._precision = np.tile(np.eye(6) / PRIOR_SIGMA**2, (problem.num_images, 1, 1))
+        self._covariance = np.tile(np.eye(6) * PRIOR_SIGMA**2, (problem.num_images, 1, 1))
+        self._error = corner_errors(self._covariance, problem.corner_twists)
+        self._seen = np.zeros(problem.num_images, np.int64)
+        self._free = np.ones(problem.num_points, bool)
+
+    def extend(self, cover: int, count: int) -> int:
+        """Choose until `count` points are chosen or all images are satisfied; gives the number chosen."""
+        for point in self._order(cover):
+            if len(self.chosen) >= count:
+                break
+            self._choose(point)
+        return len(self.chosen)
+
+    def _order(self, cover: int) -> Iterator[int]:
+        usable = self._problem.points_an_image
+        self._needed = np.minimum(cover, usable)
+        self._target = self._problem.best_corner_errors * np.sqrt(np.maximum(usable / cover, 1)) * (1 + 1e-6)
+        self._open = (self._seen < self._needed) | (self._error > self._target)
+        return greedy_order(self._all_gains(), self._gains, self._free)
+
+    def _choose(self, point: int) -> None:
+        at = self._of.at(point)
+        images, twists = self._of.images[at], self._twists[self._of.uses[at]].astype(np.float64)
+        self.chosen.append(point)
+        self._free[point] = False
+        self._seen[images] += 1
+        self._precision[images] += twists.transpose(0, 2, 1) @ twists
+        self._covariance[images] = np.linalg.inv(self._precision[images])
+        self._error[images] = corner_errors(self._covariance[images], self._problem.corner_twists[images])
+        self._open[images] = (self._seen[images] < self._needed[images]) | (
+            self._error[images] > self._target[images]
+        )
+
+    def _gains(self, points: Ids) -> Gains:
+        at, owners = self._of.all_at(points)
+        still_open = self._open[self._of.images[at]]
+        at, owners = at[still_open], owners[still_open]
+        worth = _worth(self._twists[self._of.uses[at]], self._covariance[self._of.images[at]])
+        return np.bincount(owners, worth, minlength=len(points)).astype(np.float64)
+
+    def _all_gains(self) -> Gains:
+        """The gains of all points, and a little more, so that rounding does not make a bound too low."""
+        gains = np.zeros(self._problem.num_points)
+        starts = self._problem.usable.indptr
+        for image in np.flatnonzero(self._open):
+            uses = slice(starts[image], starts[image + 1])
+            covariance = self._covariance[image][None]
+            gains[self._problem.usable.indices[uses]] += _worth(self._twists[uses], covariance)
+        return gains * (1 + 1e-9)
+
+
+def _worth(twists: Twists, covariances: Float64[np.ndarray, "m 6 6"]) -> Gains:
+    """What uses are worth to poses of these covariances, one each or one for all."""
+    pixels = twists.astype(np.float64)
+    moved = pixels @ covariances
+    (u, v), uv = np.vecdot(moved, pixels).T, np.vecdot(moved[:, 0], pixels[:, 1])
+    return 1 + _WEIGHT * np.log((1 + u) * (1 + v) - uv**2)

@@ -1,0 +1,166 @@
+"""The selection problem: which of many 3D points keep the poses of all images well determined."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+from scipy.sparse import csr_array
+
+from slimsfm.arrays import Ids
+
+Twists = Float32[np.ndarray, "n 2 6"]
+"""Pixels by which a point's image moves per unit of a camera's motion: rotation in radians, then translation
+in diagonals of the box, both in the camera's frame."""
+
+PRIOR_SIGMA = 0.01
+"""Standard deviation of each of a pose's six parameters, radians or diagonals, before any point is seen."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SelectionProblem:
+    """Points, the images that can use them, and what each use says of the image's pose.
+
+    Raises:
+        ValueError: The arrays do not fit each other.
+    """
+
+    usable: csr_array
+    """Boolean [images, points] in canonical form: the image finds the point by its descriptor."""
+
+    twists: Twists
+    """Row i belongs to the i-th true entry of `usable`."""
+
+    corner_twists: Float32[np.ndarray, "images 24 6"]
+    """How the coordinates of the box's corners, in diagonals, move with each image's pose."""
+
+    def __post_init__(self) -> None:
+        if len(self.twists) != self.usable.nnz:
+            raise ValueError(
+                f"twists must have a row for each of {self.usable.nnz} uses, got {len(self.twists)}"
+            )
+        if len(self.corner_twists) != self.num_images:
+            raise ValueError(
+                f"corner_twists must have a row for each of {self.num_images} images, "
+                f"got {len(self.corner_twists)}"
+            )
+
+    @property
+    def num_images(self) -> int:
+        """Number of images."""
+        return len(self.usable.indptr) - 1
+
+    @property
+    def num_points(self) -> int:
+        """Number of points."""
+        return (self.usable.shape or (0, 0))[1]  # scipy declares that it may be None
+
+    @cached_property
+    def points_an_image(self) -> Int64[np.ndarray, " images"]:
+        """How many points each image can use."""
+        return np.diff(self.usable.indptr).astype(np.int64)
+
+    @cached_property
+    def images_of(self) -> "ImagesOfPoints":
+        """The uses point by point."""
+        usable = self.usable
+        images = np.repeat(np.arange(self.num_images), np.diff(usable.indptr))
+        order = np.argsort(usable.indices, kind="stable")
+        starts = np.searchsorted(usable.indices[order], np.arange(self.num_points + 1))
+        return ImagesOfPoints(images=images[order], uses=order, starts=starts)
+
+    def information(self, points: Ids | None = None) -> Float64[np.ndarray, "images 6 6"]:
+        """What the prior and the chosen points (None: all) say of each image's pose, at sigma 1 px."""
+        total = np.tile(np.eye(6) / PRIOR_SIGMA**2, (self.num_images, 1, 1))
+        wanted = np.ones(self.num_points, bool)
+        if points is not None:
+            wanted[:] = False
+            wanted[points] = True
+        starts = self.usable.indptr
+        for image in range(self.num_images):
+            uses = slice(starts[image], starts[image + 1])
+            twists = self.twists[uses][wanted[self.usable.indices[uses]]].reshape(-1, 6)
+            total[image] += twists.T @ twists
+        return total
+
+    @cached_property
+    def best_corner_errors(self) -> Float64[np.ndarray, " images"]:
+        """Predicted corner error of each image's pose from all points that it can use."""
+        return self.corner_errors()
+
+    def corner_errors(self, points: Ids | None = None) -> Float64[np.ndarray, " images"]:
+        """Predicted corner error of each image's pose from the chosen points (None: all) it can use."""
+        return corner_errors(np.linalg.inv(self.information(points)), self.corner_twists)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImagesOfPoints:
+    """The uses of `SelectionProblem.usable` by point; those of point p are `starts[p]:starts[p + 1]`."""
+
+    images: Int64[np.ndarray, " uses"]
+    """The image of each use."""
+
+    uses: Int64[np.ndarray, " uses"]
+    """Its row in `SelectionProblem.twists`."""
+
+    starts: Int64[np.ndarray, " points_and_1"]
+    """Where each point's uses begin."""
+
+    def at(self, point: int) -> slice:
+        """Where the uses of a point lie."""
+        return slice(self.starts[point], self.starts[point + 1])
+
+    def all_at(self, points: Ids) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
+        """Where the uses of points lie, and for each of them which of the points it belongs to."""
+        counts = self.starts[points + 1] - self.starts[points]
+        owners = np.repeat(np.arange(len(points)), counts)
+        first = self.starts[points] - (np.cumsum(counts) - counts)
+        return first[owners] + np.arange(len(owners)), owners
+
+
+class Selector(Protocol):
+    """A method to choose points: all take these arguments."""
+
+    def __call__(self, problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
+        """Choose points.
+
+        Args:
+            problem: The points and who can use them.
+            count: How many points are wanted.
+            seed: Settles what is left to chance.
+
+        Returns:
+            Points in the order of their choice: the best first. Fewer than wanted only where no image can use
+            any more of them.
+        """
+        ...
+
+
+def corner_errors(
+    covariances: Float64[np.ndarray, "n 6 6"], corner_twists: Float32[np.ndarray, "n 24 6"]
+) -> Float64[np.ndarray, " n"]:
+    """Root mean square displacement of the box's corners, in diagonals, for poses of these covariances."""
+    squares = np.einsum("nca,nca->n", corner_twists @ covariances, corner_twists)
+    return np.sqrt(squares / 8)
+
+
+def check_count(count: int) -> None:
+    """Refuse a number of points that cannot be chosen.
+
+    Raises:
+        ValueError: It is not positive.
+    """
+    if count < 1:
+        raise ValueError(f"count must be positive, got {count}")
+
+
+def most_cover(problem: SelectionProblem, count: int) -> int:
+    """An upper bound of the K for which `count` points can be such that each image uses K, or all it can.
+
+    The points of the most uses cannot have fewer uses than the images want.
+    """
+    images_a_point = np.sort(np.diff(problem.images_of.starts))
+    images_of_at_least = np.bincount(problem.points_an_image)[::-1].cumsum()[::-1][1:]
+    wanted = np.cumsum(images_of_at_least)
+    return int(np.searchsorted(wanted, images_a_point[::-1][:count].sum(), side="right"))

@@ -1,0 +1,106 @@
+"""The selection problem of a map: who can use which point, and what that says of the pose.
+
+An image uses a point if a query that looks like the image would match it rightly. That is found out by doing
+it: the image's own descriptors are taken out of the points it sees, then its keypoints are matched against
+the points near it, and a match that projects where it was found counts. A point of a faint or ambiguous
+descriptor, or one that no second image describes, drops out by itself.
+"""
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+from scipy.sparse import csr_array
+
+from slimsfm.arrays import Ids, Points3D
+from slimsfm.features import match_nearest
+from slimsfm.geometry import reprojection_errors
+from slimsfm.mapping.map import Map
+from slimsfm.progress import ProgressBar, silent
+from slimsfm.selection.left_out import LeftOut
+from slimsfm.selection.problem import SelectionProblem, Twists
+
+_MAX_ERROR_PX = 4.0  # of a right match
+_NEIGHBOURS = 20  # images whose points an image is matched against: those of most common points
+
+
+def selection_problem(map: Map, left_out: LeftOut, progress: ProgressBar = silent) -> SelectionProblem:
+    """Find which points each reference image can use.
+
+    Notes:
+        Time is linear in the images: each is matched against the points of at most 20 others.
+    """
+    near = _points_near(map)
+    names = list(map.images)
+    found = [
+        _usable(map, left_out, name, points)
+        for name, points in zip(progress(names, "find usable points"), near, strict=True)
+    ]
+    columns = np.concatenate(found)
+    starts = np.concatenate([[0], np.cumsum([len(points) for points in found])])
+    return SelectionProblem(
+        usable=csr_array(
+            (np.ones(len(columns), bool), columns, starts), shape=(len(names), len(map.point3D_ids))
+        ),
+        twists=np.concatenate(
+            [_twists(map, name, points) for name, points in zip(names, found, strict=True)]
+        ),
+        corner_twists=np.stack([_corner_twists(map, name) for name in names]),
+    )
+
+
+def observed(map: Map) -> csr_array:
+    """Which images observe which points: a boolean matrix [images, points]."""
+    points = [np.unique(seen.points) for seen in map.observations.values()]
+    columns = np.concatenate(points)
+    starts = np.concatenate([[0], np.cumsum([len(one) for one in points])])
+    return csr_array(
+        (np.ones(len(columns), bool), columns, starts), shape=(len(points), len(map.point3D_ids))
+    )
+
+
+def _points_near(map: Map) -> list[Ids]:
+    """For each image the points, ascending, that it or its neighbours observe."""
+    sees = observed(map)
+    common = csr_array(sees.astype(np.int32) @ sees.T.astype(np.int32))
+    near = []
+    for row in range(len(map.images)):
+        others = slice(common.indptr[row], common.indptr[row + 1])
+        best = np.argsort(-common.data[others], kind="stable")[: _NEIGHBOURS + 1]  # itself among them
+        near.append(np.unique(sees[common.indices[others][best]].indices).astype(np.int64))
+    return near
+
+
+def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.ndarray, " found"]:
+    query = left_out.query(name)
+    pairs = match_nearest(query.descriptors, left_out.describe(points, name))
+    matched = points[pairs[:, 1]]
+    errors = reprojection_errors(
+        query.keypoints[pairs[:, 0]],
+        map.points3D_in_world[matched],
+        map.images[name].cam_from_world(),
+        map.camera(name),
+    )
+    return np.sort(matched[errors <= _MAX_ERROR_PX])
+
+
+def _twists(map: Map, name: str, points: Ids) -> Twists:
+    """Of an ideal pinhole camera: lens distortion changes little of what a match says of the pose."""
+    in_cam = map.images[name].cam_from_world() * map.points3D_in_world[points]
+    x, y, z = in_cam.T
+    zero = np.zeros_like(z)
+    in_pixels = np.stack([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(2, 0, 1)
+    twists = map.camera(name).mean_focal_length() * in_pixels @ _motions(in_cam, map.box.diagonal)
+    return twists.astype(np.float32)
+
+
+def _corner_twists(map: Map, name: str) -> Float32[np.ndarray, "24 6"]:
+    in_cam = map.images[name].cam_from_world() * map.box.corners
+    return (_motions(in_cam, map.box.diagonal) / map.box.diagonal).reshape(24, 6).astype(np.float32)
+
+
+def _motions(in_cam: Points3D, diagonal: float) -> Float64[np.ndarray, "n 3 6"]:
+    """How points move in the camera's frame when it turns (radians) and shifts (diagonals)."""
+    x, y, z = in_cam.T
+    zero = np.zeros_like(z)
+    turned = np.stack([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
+    shifted = np.tile(diagonal * np.eye(3), (len(in_cam), 1, 1))
+    return np.concatenate([turned, shifted], axis=2)
