@@ -14,6 +14,9 @@ from slimsfm.arrays import Points2D, Points3D
 
 _SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
+ADD_FRACTIONS = (0.1, 0.05, 0.02)
+"""Shares of the diagonal within which ADD-0.1d and its stricter kin count a pose as right."""
+
 BOX_EDGES = tuple((i, j) for i, j in combinations(range(8), 2) if np.sum(_SIGNS[i] != _SIGNS[j]) == 1)
 """Pairs of corners of a `Box` that its twelve edges join."""
 

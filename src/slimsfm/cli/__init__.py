@@ -12,6 +12,7 @@ COMMANDS = {
     "info": "what is in a map",
     "graph": "which reference images localize which others",
     "reduce": "map -> slim map",
+    "frontier": "what a map can be reduced to, and what that costs",
     "localize": "poses of new images",
     "benchmark": "speed and accuracy, full against slim",
     "synthesize": "textured objects with exact ground truth",

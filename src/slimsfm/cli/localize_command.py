@@ -55,7 +55,7 @@ def localize(
     localizer = Localizer(map_, localization)
     results = {
         name: localizer.localize(read_image(folder / name), cameras[name])
-        for name in shown(names, f"localize ({localization.strategy})")
+        for name in shown(names, f"localize ({localization.strategy_for(map_)})")
     }
     write_poses(output, results, overwrite=overwrite)
     for name, one in results.items():

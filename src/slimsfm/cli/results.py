@@ -3,7 +3,9 @@
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +17,7 @@ from slimsfm.files import replacing
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import Map
+from slimsfm.reduction import Weigh
 
 
 def maps_in(folder: Path) -> Store:
@@ -26,6 +29,18 @@ def maps_in(folder: Path) -> Store:
         return read_map(path), bytes_by_part(path)["total"]
 
     return store
+
+
+@contextmanager
+def weighing() -> Iterator[Weigh]:
+    """A way to weigh maps: each is written to a temporary folder and measured there."""
+    with tempfile.TemporaryDirectory(prefix="slimsfm-weigh-") as folder:
+
+        def weigh(map: Map) -> int:
+            write_map(map, Path(folder) / "map", overwrite=True)
+            return bytes_by_part(Path(folder) / "map")["total"]
+
+        yield weigh
 
 
 def print_comparison(rows: Sequence[Row]) -> None:

@@ -20,9 +20,9 @@ class DominationProblem:
     """A directed graph, of which the cheapest nodes that dominate all others are sought.
 
     A set D of nodes meets what node v asks for if v is in D, or if at least k nodes of D have an edge to v,
-    k being `dominators`: k-domination [1], for k = 1 that of [2]. Thus a node that could be chosen, but has
-    fewer than k in-neighbours that could, always is. A node forced out cannot be: it asks for k of them or,
-    where there are fewer, all; for nothing if there are none. A group asks for one of its nodes in D.
+    k being `dominators`: k-domination [1], for k = 1 that of [2]. Where fewer than k nodes with an edge to v
+    may be chosen, all of them are enough, but not none: a node without any is to be in D itself or, if it is
+    forced out, asks for nothing. A group asks for one of its nodes in D.
 
     Without a budget all that is asked for must be met, at the least cost. With one, the sum of the costs
     stays within it, and D is to meet as much as can be met, a group counting like a node; of sets that meet
@@ -48,7 +48,7 @@ class DominationProblem:
     """What each node costs; all cost 1 where none are given."""
 
     dominators: int
-    """How many chosen nodes dominate each node that is not chosen itself."""
+    """How many chosen nodes dominate each node that is not chosen itself, where so many could."""
 
     budget: int | float | None
     """The largest sum of costs, or None."""
@@ -121,7 +121,7 @@ class DominationProblem:
         identity = diags_array(np.ones(self.num_nodes), format="csr", dtype=np.int64)
         others = csr_array((self.adjacency.astype(np.int64) - identity).T) @ allowed
         available = np.asarray(others.sum(axis=1), dtype=np.int64).ravel()
-        needs = np.where(out, np.minimum(self.dominators, available), self.dominators)
+        needs = np.maximum(np.minimum(self.dominators, available), np.where(out, 0, 1))
         own = diags_array(np.where(out, 0, needs), format="csr", dtype=np.int64)
         grouped = csr_array(self.groups.astype(np.int64) @ allowed)
         matrix = csr_array(vstack([others + own, grouped], format="csr"))

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_error
+from slimsfm.geometry import ADD_FRACTIONS, Box, corner_error, rotation_error_deg, translation_error
 from slimsfm.localization import Localization, Seconds
-
-ADD_FRACTIONS = (0.1, 0.05, 0.02)
-"""Shares of the diagonal within which ADD-0.1d and its stricter kin count a pose as right."""
 
 DEG_CM = (1, 3, 5)
 """n of n degrees - n cm."""

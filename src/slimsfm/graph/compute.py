@@ -16,7 +16,7 @@ from slimsfm.graph.key import graph_key
 from slimsfm.graph.reference_graph import ReferenceGraph
 from slimsfm.graph.source import EdgeSource, GraphOptions, PairIndices, edge_source
 from slimsfm.mapping.io import read_map
-from slimsfm.mapping.map import Map
+from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.progress import ProgressBar, silent
 
 _TILE = 32  # images; pairs of two tiles follow each other, so that their descriptors stay in the cache
@@ -81,7 +81,9 @@ def compute_graph(
 
     Raises:
         WorkError: A block of pairs failed again and again.
+        MapError: The map was made for direct matching alone.
     """
+    check_has_features(map)
     start = perf_counter()
     source = edge_source(map, options)
     pairs = _in_tiles(source.pairs())

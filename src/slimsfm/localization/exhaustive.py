@@ -7,13 +7,14 @@ nothing.
 from slimsfm.arrays import Descriptors, IndexPairs
 from slimsfm.features import NearestOptions, match_nearest, unit_rows
 from slimsfm.localization.strategy import PointMatches, unite
-from slimsfm.mapping.map import Map
+from slimsfm.mapping.map import Map, check_has_features
 
 
 class Exhaustive:
     """Matches against all reference images. O(references x keypoints x points seen) a query."""
 
     def __init__(self, map: Map, matching: NearestOptions = NearestOptions()) -> None:
+        check_has_features(map)
         self._matching = matching
         self._references = [
             (unit_rows(map.features[name].descriptors[seen.rows]), seen.points)

@@ -25,17 +25,24 @@ STRATEGIES = {
 class LocalizationOptions:
     """How queries are localized."""
 
-    strategy: str = "exhaustive"
-    """Match against each reference image (exhaustive) or against the points (direct)."""
+    strategy: str = "auto"
+    """Match against each reference image (exhaustive) or against the points (direct); auto: direct where the
+    map has points chosen for it."""
 
     ransac: RansacOptions = RansacOptions()
     """The pose search."""
 
     def __post_init__(self) -> None:
-        if self.strategy not in STRATEGIES:
+        if self.strategy not in ("auto", *STRATEGIES):
             raise ValueError(
-                f"strategy must be one of {', '.join(sorted(STRATEGIES))}, got {self.strategy!r}"
+                f"strategy must be auto or one of {', '.join(sorted(STRATEGIES))}, got {self.strategy!r}"
             )
+
+    def strategy_for(self, map: Map) -> str:
+        """The strategy to use with a map."""
+        if self.strategy != "auto":
+            return self.strategy
+        return "exhaustive" if map.point_descriptors is None else "direct"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +85,7 @@ class Localizer:
         self._map = map
         self._options = options
         self._extractor = load_extractor(map.info.extractor, map.info.extractor_options)
-        module, attribute = STRATEGIES[options.strategy].split(":")
+        module, attribute = STRATEGIES[options.strategy_for(map)].split(":")
         self._strategy: Strategy = getattr(import_module(module), attribute)(map)
 
     def localize(self, image: Image, camera: pycolmap.Camera | None = None) -> Localization:

@@ -4,6 +4,7 @@ MAP/
   sparse/       COLMAP model, opens in COLMAP, pycolmap and hloc
   features.h5   local features in hloc's layout
   matches.h5    verified matches in hloc's layout; may be missing
+  points.npz    points to match directly; may be missing, or there instead of features.h5 and matches.h5
   map.json      format version, extractor and its options, box, unit, origin
 """
 
@@ -19,6 +20,7 @@ from slimsfm.files import replacing
 from slimsfm.geometry import Box
 from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
+from slimsfm.mapping.point_file import read_point_descriptors, write_point_descriptors
 
 FORMAT_VERSION = 1
 """Version of the layout; a map of a later one is refused."""
@@ -33,17 +35,22 @@ def read_map(path: Path) -> Map:
     info = _read_info(path)
     try:
         model = read_model(path / "sparse")
-        features = FeatureFile(path / "features.h5")
-        matches = path / "matches.h5"
+        points = path / "points.npz"
+        direct = read_point_descriptors(points, model.num_points3D()) if points.exists() else None
         names = sorted(model.image(i).name for i in model.reg_image_ids())
+        matches = path / "matches.h5"
+        features = (
+            None if direct and not (path / "features.h5").exists() else FeatureFile(path / "features.h5")
+        )
         map_ = Map(
             model=model,
-            features=features,
+            features=features or {},
             matches=MatchFile(matches, names) if matches.exists() else {},
+            point_descriptors=direct,
             info=info,
         )
         check_map(map_)
-        for name, image in map_.images.items():
+        for name, image in map_.images.items() if features else ():
             check_count(image, features.count(name))
     except InputError as error:
         raise MapError(f"{path}: not a usable map: {error}") from error
@@ -61,15 +68,22 @@ def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
     with replacing(path, overwrite=overwrite) as partial:
         (partial / "sparse").mkdir(parents=True)
         map.model.write(partial / "sparse")
-        with FeatureWriter(partial / "features.h5") as writer:
-            for name, image in map.images.items():
-                features = map.features[name]
-                check_count(image, len(features))
-                writer.write(name, features)
+        if map.features:
+            _write_features(map, partial / "features.h5")
         if map.matches:
             counts = {name: image.num_points2D() for name, image in map.images.items()}
             write_matches(partial / "matches.h5", map.matches, counts)
+        if map.point_descriptors:
+            write_point_descriptors(partial / "points.npz", map.point_descriptors)
         (partial / "map.json").write_text(json.dumps(_info_to_json(map.info), indent=2) + "\n")
+
+
+def _write_features(map: Map, path: Path) -> None:
+    with FeatureWriter(path) as writer:
+        for name, image in map.images.items():
+            features = map.features[name]
+            check_count(image, len(features))
+            writer.write(name, features)
 
 
 def bytes_by_part(path: Path) -> dict[str, int]:
@@ -77,7 +91,7 @@ def bytes_by_part(path: Path) -> dict[str, int]:
     sizes = {
         part.name: sum(file.stat().st_size for file in [part, *part.rglob("*")] if file.is_file())
         for part in sorted(path.iterdir())
-        if part.name in ("sparse", "features.h5", "matches.h5", "map.json")
+        if part.name in ("sparse", "features.h5", "matches.h5", "points.npz", "map.json")
     }
     return {**sizes, "total": sum(sizes.values())}
 

@@ -1,6 +1,6 @@
 """A map of some of the images: what the paper calls X' and P'."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ import pycolmap
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features import Features
-from slimsfm.mapping.map import Map
+from slimsfm.mapping.map import Map, check_has_features
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -23,7 +23,9 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
 
     Raises:
         InputError: A name is not that of a reference image, or no name is given.
+        MapError: The map was made for direct matching alone.
     """
+    check_has_features(map)
     kept = sorted(set(names))
     if not kept:
         raise InputError("no image was chosen to be kept")
@@ -36,7 +38,7 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
     features: Mapping[str, Features] = Selection(map.features, chosen.__contains__)
     matches: Mapping[tuple[str, str], IndexPairs] = Selection(map.matches, chosen.issuperset)
     model = _subset_model(map, kept, min_track_length)
-    return replace(map, model=model, features=features, matches=matches)
+    return replace(map, model=model, features=features, matches=matches, point_descriptors=None)
 
 
 class Selection(Mapping[Key, Value]):
@@ -62,17 +64,49 @@ class Selection(Mapping[Key, Value]):
 
 
 def _subset_model(map: Map, names: list[str], min_track_length: int) -> pycolmap.Reconstruction:
+    model = copy_images(map, names)
+    kept = {map.images[name].image_id for name in names}
+    tracks = {point3D_id: track_in(map, point3D_id, kept) for point3D_id in map.point3D_ids.tolist()}
+    copy_points(map, model, {i: track for i, track in tracks.items() if len(track) >= min_track_length})
+    return model
+
+
+def track_in(map: Map, point3D_id: int, image_ids: Container[int]) -> list[pycolmap.TrackElement]:
+    """The observations of a point in some images."""
+    return [one for one in map.model.points3D[point3D_id].track.elements if one.image_id in image_ids]
+
+
+def copy_images(map: Map, names: list[str], *, keypoints: bool = True) -> pycolmap.Reconstruction:
+    """A model of some reference images, their cameras and rigs, but no points yet.
+
+    Args:
+        map: The map.
+        names: The images.
+        keypoints: Keep the images' keypoints.
+    """
     model = pycolmap.Reconstruction()
     kept = {map.images[name].image_id: map.images[name] for name in names}
     _copy_cameras_and_rigs(map.model, model, kept)
     for image_id in sorted(kept):
         image = kept[image_id]
         copy = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image_id)
-        copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
+        if keypoints:
+            copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
         copy.frame_id = image.frame_id
         model.add_image(copy)
-    _copy_points(map, model, kept, min_track_length)
     return model
+
+
+def copy_points(
+    map: Map, model: pycolmap.Reconstruction, tracks: Mapping[int, list[pycolmap.TrackElement]]
+) -> None:
+    """Add points of a map, by id and with these tracks, to a model of some of its images."""
+    points = map.model.points3D
+    for point3D_id, track in tracks.items():
+        point = points[point3D_id]
+        copy = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error)
+        copy.track = pycolmap.Track(track)
+        model.add_point3D_with_id(point3D_id, copy)
 
 
 def _copy_cameras_and_rigs(
@@ -98,15 +132,3 @@ def _frame_of(frame: pycolmap.Frame, kept: dict[int, pycolmap.Image]) -> pycolma
             copy.add_data_id(data)
     copy.rig_from_world = frame.rig_from_world
     return copy
-
-
-def _copy_points(map: Map, model: pycolmap.Reconstruction, kept: dict, min_track_length: int) -> None:
-    points = map.model.points3D
-    for point3D_id in map.point3D_ids.tolist():
-        point = points[point3D_id]
-        elements = [element for element in point.track.elements if element.image_id in kept]
-        if len(elements) < min_track_length:
-            continue
-        copy = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error)
-        copy.track = pycolmap.Track(elements)
-        model.add_point3D_with_id(point3D_id, copy)

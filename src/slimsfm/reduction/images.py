@@ -1,14 +1,22 @@
 """From a map to a slim one: keep a dominating set of the reference images and the points they see."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
+from scipy.sparse import csr_array
 
-from slimsfm.domination import SOLVERS, DominationProblem, Solution
+from slimsfm.domination import SOLVERS, DominationProblem, Solution, cover_order
 from slimsfm.errors import InputError
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
+from slimsfm.reduction.rim import rim_groups
+
+Cost = Literal["image", "observations"]
+
+_PAPER = "random"  # the solver that knows of no errors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,10 +27,28 @@ class ReductionOptions:
     """Largest relative corner error of a pose for which an image counts as localized."""
 
     solver: str = "exact"
-    """Who chooses the dominating set: "exact" (minimum, proven) or "random" (the paper's)."""
+    """Who chooses the dominating set: "exact" (minimum, proven), "cpsat" (the same for thousands of images,
+    with OR-Tools), "greedy" (fast) or "random" (the paper's)."""
 
     seed: int = 0
     """Seed of every random choice."""
+
+    dominators: int = 1
+    """How many kept images localize each one that is not kept, or all that can where there are fewer."""
+
+    rim: bool = False
+    """Localize the images at the rim of the capture from images nearly as far out, and keep each part of the
+    object's surface in sight: queries from the rim find fewer images on one side than others do."""
+
+    cost: Cost = "image"
+    """What is to be least: the number of images kept, or that of their observations, with which memory and
+    the time of exhaustive matching grow."""
+
+    max_images: int | None = None
+    """Keep at most so many images. Those that localize the most are kept where this is too few for all."""
+
+    best: bool = True
+    """Of the smallest sets take one with the least sum of errors. The paper's solver takes its first one."""
 
     def __post_init__(self) -> None:
         if not self.threshold > 0:
@@ -31,6 +57,14 @@ class ReductionOptions:
             raise ValueError(f"solver must be one of {', '.join(sorted(SOLVERS))}, got {self.solver!r}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
+        if self.dominators < 1:
+            raise ValueError(f"dominators must be at least 1, got {self.dominators}")
+        if self.cost not in get_args(Cost):
+            raise ValueError(f"cost must be one of {', '.join(get_args(Cost))}, got {self.cost!r}")
+        if self.max_images is not None and self.max_images < 1:
+            raise ValueError(f"max_images must be at least 1, got {self.max_images}")
+        if self.max_images is not None and self.cost != "image":
+            raise ValueError(f"max_images limits a number of images: cost must be image, got {self.cost!r}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,16 +92,99 @@ def reduce_map(map: Map, graph: ReferenceGraph, options: ReductionOptions = Redu
     References:
         [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set, 2025.
     """
-    if graph.names != tuple(map.images):
-        raise ValueError("graph must be of this map, but its images are others")
-    solution = dominating_set(graph, options)
+    solution = dominating_set(graph, options, map)
     return Reduction(map=keep_images(map, (graph.names[i] for i in solution.chosen)), solution=solution)
 
 
-def dominating_set(graph: ReferenceGraph, options: ReductionOptions) -> Solution:
-    """Choose the images that localize all others, by index into the graph's names."""
-    problem = DominationProblem(graph.adjacency(options.threshold))
-    return SOLVERS[options.solver](problem, seed=options.seed)
+def dominating_set(graph: ReferenceGraph, options: ReductionOptions, map: Map | None = None) -> Solution:
+    """Choose the images that localize all others, by index into the graph's names.
+
+    Args:
+        graph: The reference graph.
+        options: How to choose. A limit on the images that suffices changes nothing.
+        map: The map of the graph; only `rim` and costs other than "image" need it.
+
+    Raises:
+        ValueError: The options need the map, or the graph is of another map.
+    """
+    solve = SOLVERS[options.solver]
+    found = solve(_problem(graph, options, map, limit=None), seed=options.seed)
+    if options.max_images is None or len(found.chosen) <= options.max_images:
+        return found
+    return solve(_problem(graph, options, map, limit=options.max_images), seed=options.seed)
+
+
+def image_order(graph: ReferenceGraph, options: ReductionOptions, map: Map | None = None) -> tuple[str, ...]:
+    """Order all images such that every first few of them localize as many others as so few can, or nearly.
+
+    The dominating set comes first, then images that localize others a second time, a third time and so on.
+    Who stops anywhere has a good set, and the next image only adds to it.
+
+    Args:
+        graph: The reference graph.
+        options: How the dominating set is chosen, and what an image costs.
+        map: The map of the graph; only `rim` and costs other than "image" need it.
+
+    Raises:
+        ValueError: The options need the map, or the graph is of another map.
+    """
+    first = dominating_set(graph, options, map).chosen
+    order = cover_order(_problem(graph, options, map, limit=None), first=first)
+    return tuple(graph.names[i] for i in order)
+
+
+def images_within(order: tuple[str, ...], fits: Callable[[tuple[str, ...]], bool]) -> tuple[str, ...]:
+    """The longest beginning of an order of images that keeps to a limit, in bytes or points or else.
+
+    Args:
+        order: Names, the most important first.
+        fits: Whether some images keep to the limit. More images must not keep to it where fewer do not.
+
+    Returns:
+        The first of the names, in order; none where the first one alone is too much.
+
+    Notes:
+        Bisection: `fits` is called about log2(len(order)) times.
+    """
+    fitting, too_many = 0, len(order) + 1
+    while too_many - fitting > 1:
+        middle = (fitting + too_many) // 2
+        if fits(order[:middle]):
+            fitting = middle
+        else:
+            too_many = middle
+    return order[:fitting]
+
+
+def _problem(
+    graph: ReferenceGraph, options: ReductionOptions, map: Map | None, *, limit: int | None
+) -> DominationProblem:
+    if map is not None and graph.names != tuple(map.images):
+        raise ValueError("graph must be of this map, but its images are others")
+    return DominationProblem(
+        graph.adjacency(options.threshold),
+        costs=_costs(options, map),
+        dominators=options.dominators,
+        budget=limit,
+        groups=_groups(graph, options, map),
+        errors=graph.errors if options.best and options.solver != _PAPER else None,
+    )
+
+
+def _costs(options: ReductionOptions, map: Map | None) -> np.ndarray | None:
+    if options.cost == "image":
+        return None
+    if map is None:
+        raise ValueError(f"map must be given where cost is {options.cost!r}")
+    return np.array([max(len(seen.rows), 1) for seen in map.observations.values()], np.float64)
+
+
+def _groups(graph: ReferenceGraph, options: ReductionOptions, map: Map | None) -> csr_array | None:
+    if not options.rim:
+        return None
+    if map is None:
+        raise ValueError("map must be given where rim is set")
+    return rim_groups(map, graph.adjacency(options.threshold))
 
 
 def keep_random_images(map: Map, count: int, *, seed: int) -> Map:

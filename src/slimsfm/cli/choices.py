@@ -1,0 +1,117 @@
+"""Words and tables about ways to reduce a map."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from slimsfm.cli.output import console, counts, size
+from slimsfm.geometry import ADD_FRACTIONS
+from slimsfm.mapping.io import bytes_by_part
+from slimsfm.mapping.map import Map
+from slimsfm.reduction import Candidate, Frontier, Prediction
+
+
+def print_change(full_path: Path, full: Map, slim_path: Path, slim: Map) -> None:
+    """A table of what a map holds before and after."""
+    before = {**counts(full), "bytes": bytes_by_part(full_path)["total"]}
+    after = {**counts(slim), "bytes": bytes_by_part(slim_path)["total"]}
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for column in ("", "before", "after", "factor"):
+        table.add_column(column, justify="right" if column else "left")
+    for name in before:
+        shown_as = size if name == "bytes" else str
+        factor = f"{before[name] / after[name]:.1f}" if after[name] else ""
+        table.add_row(name, shown_as(before[name]), shown_as(after[name]), factor)
+    console.print(table)
+
+
+def promise(full_path: Path, full: Map, candidate: Candidate) -> str:
+    """What was kept and what it is predicted to do, in one sentence."""
+    choice, tests = candidate.choice, len(candidate.prediction.tests)
+    before = f"{len(full.images)} images, {len(full.point3D_ids)} points, "
+    before += size(bytes_by_part(full_path)["total"])
+    images = f"{len(choice.images)} images, " if choice.images else ""
+    after = f"{images}{len(choice.points)} points, {size(candidate.bytes)}"
+    if not tests:
+        return f"{before} -> {after}; no image is left out to predict by"
+    found = candidate.full.within(ADD_FRACTIONS[0])
+    share = 100 * candidate.prediction.within(ADD_FRACTIONS[0]) / found if found else 0.0
+    return (
+        f"{before} -> {after}; predicted to localize {min(share, 100):.3g} % of what the full map does, "
+        f"{candidate.full.seconds / candidate.seconds:.3g}x faster (measured on {tests} images left out)"
+    )
+
+
+def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], full_bytes: int) -> None:
+    """The table of all candidates: what is dominated is dim, what is recommended bold."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for column in ("for", "method", "asked for"):
+        table.add_column(column)
+    for column in ("images", "points", "size", *(f"{fraction}d" for fraction in ADD_FRACTIONS)):
+        table.add_column(column, justify="right")
+    for column in ("loss", "median", "match+pose", ""):
+        table.add_column(column, justify="right" if column else "left")
+    table.add_row("", "full map", "", "", "", size(full_bytes), *_figures(frontier.full, 0.0))
+    for one in sorted(frontier.candidates, key=lambda one: (one.choice.use, one.choice.method, one.bytes)):
+        remark, style = _remark(frontier, recommended, one)
+        choice = one.choice
+        what = (choice.use, choice.method, choice.detail, str(len(choice.images) or ""))
+        weight = (str(len(choice.points)), size(one.bytes))
+        table.add_row(*what, *weight, *_figures(one.prediction, one.loss), remark, style=style)
+    console.print(table)
+    console.print(
+        f"0.1d, 0.05d, 0.02d: % of up to {len(frontier.full.tests)} images, left out and handicapped, with "
+        "box corners off by less than this share of the diagonal d; loss: most points lost against the full "
+        "map on the same images; dominated: another for the same use is no larger and loses no more",
+        style="dim",
+    )
+
+
+def _figures(prediction: Prediction, loss: float) -> list[str]:
+    shares = [f"{prediction.within(fraction):.1f}" for fraction in ADD_FRACTIONS]
+    return [*shares, f"{loss:.1f}", f"{prediction.median_error:.4f}d", f"{1e3 * prediction.seconds:.2f} ms"]
+
+
+def _remark(
+    frontier: Frontier, recommended: Mapping[str, Candidate], one: Candidate
+) -> tuple[str, str | None]:
+    if any(best is one for best in recommended.values()):
+        return "recommended", "bold"
+    return ("dominated", "dim") if frontier.is_dominated(one) else ("", None)
+
+
+def frontier_to_json(
+    frontier: Frontier, recommended: Mapping[str, Candidate], full: Map, full_bytes: int
+) -> dict:
+    """All candidates as plain values; what has no value is None."""
+    counted = {"images": len(full.images), "points": len(full.point3D_ids), "bytes": full_bytes}
+    return {
+        "full": counted | _prediction_to_json(frontier.full),
+        "candidates": [
+            {
+                "for": one.choice.use,
+                "method": one.choice.method,
+                "asked_for": one.choice.detail,
+                "images": list(one.choice.images),
+                "points": len(one.choice.points),
+                "bytes": one.bytes,
+                "loss": one.loss,
+                "dominated": frontier.is_dominated(one),
+                "recommended": any(best is one for best in recommended.values()),
+                **_prediction_to_json(one.prediction),
+            }
+            for one in frontier.candidates
+        ],
+    }
+
+
+def _prediction_to_json(prediction: Prediction) -> dict:
+    median = prediction.median_error
+    return {
+        "tests": len(prediction.tests),
+        **{f"add_{fraction}d": prediction.within(fraction) for fraction in ADD_FRACTIONS},
+        "median_corner_error": median if np.isfinite(median) else None,
+        "ms": 1e3 * prediction.seconds,
+    }
