@@ -8,44 +8,21 @@ process on one thread, one after the other.
 """
 
 import argparse
-import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from benchmark_scenes import Scene, scenes
 
-from slimsfm.cli import run
-from slimsfm.datasets.images import hold_out, query_names
-from slimsfm.datasets.mapping import map_object
-from slimsfm.datasets.onepose import read_object
-from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.domination import DominationProblem, exact
 from slimsfm.evaluation.metrics import add_percent
-from slimsfm.evaluation.protocol import (
-    PreparedQuery,
-    errors_of,
-    held_out_queries,
-    localize_all,
-    prepare,
-    queries_of,
-)
+from slimsfm.evaluation.protocol import errors_of, localize_all
 from slimsfm.graph import GraphOptions, GraphRun, compute_graph
 from slimsfm.graph.candidates import all_pairs, likely_pairs
-from slimsfm.mapping import Map, keep_images, read_map, write_map
+from slimsfm.mapping import Map, keep_images
 from slimsfm.progress import shown
 
 THRESHOLD = 0.05
-RENDERED = SynthesisOptions(objects=("printed_box", "boulder"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scene:
-    """A map of references and queries that it knows nothing of."""
-
-    name: str
-    references: Map
-    queries: list[PreparedQuery]
+RENDERED = ("printed_box", "boulder")
 
 
 def main() -> None:
@@ -54,36 +31,8 @@ def main() -> None:
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("-o", "--output", required=True, type=Path)
     arguments = parser.parse_args()
-    for scene in scenes(arguments.folders, arguments.output):
+    for scene in scenes(arguments.folders, RENDERED, arguments.output):
         compare(scene)
-
-
-def scenes(folders: list[Path], output: Path) -> Iterator[Scene]:
-    """The folders of photos, then the rendered objects."""
-    for folder in folders:
-        results = output / folder.name
-        if not (results / "pseudo-ground-truth").exists():
-            run(["benchmark", "images", str(folder), "-o", str(results), "--variants", "full"])
-        truth = read_map(results / "pseudo-ground-truth")
-        names = query_names(list(truth.images), 3)
-        queries = held_out_queries(truth, folder, names)
-        references = hold_out(truth, names)
-        yield Scene(name=folder.name, references=references, queries=prepare(references, queries))
-    for name in RENDERED.objects:
-        yield rendered(name, output)
-
-
-def rendered(name: str, output: Path) -> Scene:
-    """A rendered object, mapped from its known poses."""
-    if not (output / "objects" / name).exists():
-        synthesize(output / "objects", SynthesisOptions(objects=(name,)), progress=shown)
-    made = read_object(output / "objects" / name)
-    with tempfile.TemporaryDirectory() as workspace:
-        built = map_object(made, Path(workspace), progress=shown).map
-        write_map(built, output / f"{name}-map", overwrite=True)
-    references = read_map(output / f"{name}-map")
-    queries = queries_of(made.query)
-    return Scene(name=name, references=references, queries=prepare(references, queries))
 
 
 def compare(scene: Scene) -> None:

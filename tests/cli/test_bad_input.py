@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from commands import contents, slimsfm
+from slimsfm.selection import SELECTORS
 
 
 @pytest.fixture
@@ -107,6 +108,7 @@ def test_a_missing_map(refused, boulder, tmp_path):
     missing = tmp_path / "nowhere"
     refused("info", missing, naming=missing)
     refused("reduce", missing, "-o", tmp_path / "slim", naming=missing)
+    refused("frontier", missing, naming=missing)
     refused("localize", missing, boulder.queries, "-o", tmp_path / "poses.json", naming=missing)
     refused("info", boulder.queries / "0.png", naming="not a map")
 
@@ -129,20 +131,44 @@ def test_an_import_without_or_with_two_sources(refused, boulder, tmp_path):
 def test_a_map_of_one_image_cannot_be_reduced(refused, boulder, tmp_path):
     assert slimsfm("reduce", boulder.map_path, "-o", tmp_path / "one", "--images", "3.png").code == 0
     refused("reduce", tmp_path / "one", "-o", tmp_path / "slim", naming=tmp_path / "one")
+    refused("frontier", tmp_path / "one", naming=tmp_path / "one")
 
 
 @pytest.mark.parametrize(
     ("arguments", "naming"),
     [
-        (("--solver", "oracle"), "solver must be one of exact, random, got 'oracle'"),
+        (("--solver", "oracle"), "solver must be one of cpsat, exact, greedy, random, got 'oracle'"),
         (("--threshold", "-1"), "threshold must be positive, got -1.0"),
         (("--threshold", "nan"), "threshold must be positive, got nan"),
         (("--threshold", "high"), "--threshold"),
         (("--seed", "-1"), "seed must not be negative, got -1"),
+        (("--seed", "-1", "--random", "3"), "seed must not be negative, got -1"),
+        (("--seed", "-1", "--solver", "exact"), "seed must not be negative, got -1"),
         (("--random", "31"), "31 random images"),
         (("--random", "0"), "0 random images"),
         (("--images", "3.png", "nobody.png"), "'nobody.png'"),
         (("--images", "3.png", "--random", "2"), "--images and --random"),
+        (("--images", "3.png", "--solver", "exact"), "--images and options of image choice"),
+        (("--random", "2", "--paper"), "--random and options of image choice"),
+        (("--paper", "--solver", "exact"), "paper excludes all other ways"),
+        (("--paper", "--rim"), "paper excludes all other ways"),
+        (("--for", "fun"), "'fun'"),
+        (("--selector", "oracle"), f"selector must be one of {', '.join(SELECTORS)}, got 'oracle'"),
+        (("--selector", "random", "--for", "images"), "--selector chooses points"),
+        (("--selector", "random", "--solver", "exact"), "--selector chooses points"),
+        (("--max-bytes", "12 parsecs"), "max-bytes must be a size such as 100kB or 2MB, got '12 parsecs'"),
+        (("--max-bytes", "-1"), "max-bytes"),
+        (("--max-loss", "a little"), "max-loss must be a percentage such as 1%, got 'a little'"),
+        (("--max-loss", "1 kB"), "max-loss must be a percentage"),
+        (("--max-ms", "-1"), "max_ms must not be negative, got -1.0"),
+        (("--max-ms", "nan"), "max_ms must not be negative, got nan"),
+        (("--max-points", "-1"), "max_points must not be negative, got -1"),
+        (("--max-loss", "1%", "--solver", "exact"), "leave out how images are chosen"),
+        (("--max-ms", "5", "--paper"), "leave out how images are chosen"),
+        (("--max-images", "0", "--solver", "exact"), "max_images must be at least 1, got 0"),
+        (("--max-images", "3", "--cost", "observations"), "cost must be image, got 'observations'"),
+        (("--max-bytes", "1kB", "--images", "3.png", "11.png"), "limits do not go with them"),
+        (("--max-points", "100", "--random", "2"), "limits do not go with them"),
         (("--treshold", "0.1"), "--treshold"),
     ],
     ids=str,
@@ -154,7 +180,25 @@ def test_bad_options_of_reduce(refused, boulder, tmp_path, arguments, naming):
 @pytest.mark.parametrize(
     ("arguments", "naming"),
     [
-        (("--strategy", "guess"), "strategy must be one of direct, exhaustive, got 'guess'"),
+        (("--uses", "fun"), "uses must be among direct, images, got fun"),
+        (("--selectors", "oracle"), f"selectors must be among {', '.join(SELECTORS)}, got oracle"),
+        (("--budgets", "0"), "budgets must be positive, got (0,)"),
+        (("--budgets", "many"), "--budgets"),
+        (("--dominators", "0"), "dominators must be positive, got (0,)"),
+        (("--seed", "-1"), "seed must not be negative, got -1"),
+        (("--edges", "guess"), "'guess'"),
+    ],
+    ids=str,
+)
+def test_bad_options_of_frontier(refused, boulder, tmp_path, arguments, naming):
+    output = tmp_path / "frontier.json"
+    refused("frontier", boulder.map_path, "--json", output, *arguments, naming=naming)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "naming"),
+    [
+        (("--strategy", "guess"), "strategy must be auto or one of direct, exhaustive, got 'guess'"),
         (("--max-error-px", "0"), "max_error_px must be positive, got 0.0"),
         (("--min-inliers", "3"), "min_inliers must be at least 4, got 3"),
         (("--camera", "missing.txt"), "missing.txt"),
@@ -192,7 +236,7 @@ def test_bad_options_of_synthesize(refused, tmp_path):
     refused("synthesize", "-o", tmp_path / "out", "--width", 0, naming="width must be positive, got 0")
 
 
-@pytest.mark.parametrize("command", ["build", "import", "reduce", "localize", "synthesize"])
+@pytest.mark.parametrize("command", ["build", "import", "reduce", "frontier", "localize", "synthesize"])
 def test_missing_arguments(refused, command):
     refused(command, naming=f"see slimsfm {command} --help")
 
@@ -211,6 +255,8 @@ def test_an_output_that_exists(refused, boulder, tmp_path, kind):
         output.mkdir()
         (output / "notes.txt").write_text("mine")
     refused("reduce", boulder.map_path, "-o", output, naming=output)
+    refused("frontier", boulder.map_path, "--json", output, naming=output)
+    refused("frontier", boulder.map_path, "--curves", output, naming=output)
     refused("build", boulder.photos, "-o", output, naming=output)
     refused("localize", boulder.map_path, boulder.queries, "-o", output, naming=output)
     refused("import", boulder.map_path / "sparse", "-o", output, "--images", boulder.photos, naming=output)

@@ -147,6 +147,21 @@ def test_an_interrupted_graph_goes_on_where_it_stopped(boulder, start, tmp_path,
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("command", ["reduce", "frontier"])
+def test_an_interrupted_comparison_leaves_nothing(boulder, start, tmp_path, command, how):
+    before = contents(boulder.map_path)
+    outputs = {
+        "reduce": ("-o", tmp_path / "slim"),
+        "frontier": ("--uses", "direct", "--json", tmp_path / "f.json", "--curves", tmp_path / "f.svg"),
+    }
+    process = start(command, boulder.map_path, *outputs[command])
+    wait_until(process, lambda: list((tmp_path / "tmp").glob("slimsfm-weigh-*/map")))
+    assert_interrupted(process, how, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["tmp"]
+    assert contents(boulder.map_path) == before
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_an_interrupted_synthesis_leaves_nothing(start, tmp_path, how):
     process = start("synthesize", "-o", tmp_path / "out", "--objects", "can", "--mapping-frames", 500)
     wait_until(process, lambda: list(tmp_path.glob("out/.can.partial/can-1/color_full/*.png")))

@@ -61,7 +61,8 @@ def unmet_of(problem, sets):
     edges = problem.adjacency.toarray() & ~np.eye(n, dtype=bool)
     out = np.isin(np.arange(n), problem.forced_out)
     dominators = sets.astype(int) @ edges
-    asked = np.where(out, np.minimum(k, edges[~out].sum(axis=0)), k)
+    available = edges[~out].sum(axis=0)
+    asked = np.where(available > 0, np.minimum(k, available), np.where(out, 0, n))
     met = sets | (dominators >= asked)
     in_group = sets.astype(int) @ problem.groups.toarray().T.astype(int) > 0
     return (~met).sum(axis=1) + (~in_group).sum(axis=1), met

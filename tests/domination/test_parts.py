@@ -33,10 +33,18 @@ def test_a_node_forced_out_may_not_be_chosen():
     assert not DominationProblem(PATH, forced_out=[2]).satisfies([0, 1, 2])
 
 
-def test_a_node_with_too_few_dominators_is_chosen_itself():
+def test_a_node_that_could_have_too_few_dominators_asks_for_all_of_them():
+    problem = DominationProblem(PATH | PATH.T, dominators=2)
+    assert problem.satisfies([1])
+    assert not problem.satisfies([0])
+    assert problem.satisfies([0, 2])
+    assert DominationProblem(PATH, dominators=2, forced_out=[1]).satisfies([0, 2])
+
+
+def test_a_node_that_none_can_dominate_is_chosen_itself():
     problem = DominationProblem(PATH, dominators=2)
-    assert problem.satisfies([0, 1, 2])
-    assert not problem.satisfies([0, 1])
+    assert problem.satisfies([0, 1])
+    assert not problem.satisfies([1, 2])
 
 
 def test_a_node_forced_out_asks_for_as_many_dominators_as_there_are():

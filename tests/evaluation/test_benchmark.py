@@ -47,15 +47,22 @@ def store(stored):
     return keep
 
 
+def weigh(map_):
+    return 100 * len(map_.point3D_ids)
+
+
 def test_a_benchmark_of_an_exact_scene(narrow, graph, queries, stored, store):
-    result = benchmark(narrow, graph, queries, name="exact", store=store)
+    result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh)
     labels = [(row.strategy, row.variant) for row in result.rows]
-    assert labels == [(s, v) for s in ("exhaustive", "direct") for v in ("full", "dominating", "random")]
+    images = ["full", "dominating", "random"]
+    assert labels == [("exhaustive", v) for v in images] + [
+        ("direct", v) for v in [*images[:2], "default", images[2]]
+    ]
     count = len(result.solution.chosen)
     assert dominates(graph.adjacency(), result.solution.chosen)
     for row in result.rows:
         assert row.object == "exact"
-        assert row.references == (10 if row.variant == "full" else count)
+        assert row.references == (10 if row.variant in ("full", "default") else count)
         assert row.map_bytes == 1000 * row.references
         assert row.scores.queries == 10
         assert row.scores.seconds.extract == 0.25
@@ -64,13 +71,15 @@ def test_a_benchmark_of_an_exact_scene(narrow, graph, queries, stored, store):
             assert row.scores.add == {0.1: 100.0, 0.05: 100.0, 0.02: 100.0}
             assert row.scores.deg_cm == {1: 100.0, 3: 100.0, 5: 100.0}
             assert row.scores.median_corner_error < 1e-4
-    assert set(stored) == {"full-0", "dominating-0", *(f"random-{i}" for i in range(5))}
+    assert set(stored) == {"full-0", "dominating-0", "default-0", *(f"random-{i}" for i in range(5))}
+    assert stored["default-0"].is_for_direct_matching
+    assert len(stored["default-0"].point3D_ids) < len(narrow.point3D_ids)
     assert list(stored["dominating-0"].images) == [graph.names[i] for i in result.solution.chosen]
 
 
 def test_random_variants_are_the_five_seeds_and_their_row_the_mean(narrow, graph, queries, stored, store):
     options = BenchmarkOptions(strategies=("direct",), variants=("random",))
-    result = benchmark(narrow, graph, queries, name="exact", store=store, options=options)
+    result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh, options=options)
     (row,) = result.rows
     count = len(result.solution.chosen)
     draws = [keep_random_images(narrow, count, seed=seed) for seed in range(5)]
@@ -84,7 +93,7 @@ def test_the_threshold_of_the_reduction_is_obeyed(narrow, graph, queries, store)
     strict = BenchmarkOptions(
         strategies=("direct",), variants=("dominating",), reduction=ReductionOptions(threshold=1e-12)
     )
-    result = benchmark(narrow, graph, queries, name="exact", store=store, options=strict)
+    result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh, options=strict)
     assert len(result.solution.chosen) == 10
 
 
@@ -125,7 +134,7 @@ def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
             "strategies must be among direct, exhaustive, got direct, guess",
         ),
         ({"strategies": ()}, "strategies must be among .* got none"),
-        ({"variants": ("half",)}, "variants must be among full, dominating, random, got half"),
+        ({"variants": ("half",)}, "variants must be among full, dominating, default, random, got half"),
     ],
 )
 def test_bad_options_are_named(values, message):

@@ -12,7 +12,9 @@ from scenes import BOX, camera, poses
 from slimsfm.features import Features, unit_rows
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
+from slimsfm.localization.direct import describe_points
 from slimsfm.localization.strategy import Strategy, unite
+from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.map import Map
 
 TENTH_OF_A_PER_MILLE = 1e-4
@@ -124,5 +126,16 @@ def test_uniting_is_the_union_of_sets(parts):
 
 
 def test_an_unknown_strategy_is_named():
-    with pytest.raises(ValueError, match="strategy must be one of direct, exhaustive, got 'guess'"):
+    with pytest.raises(ValueError, match="strategy must be auto or one of direct, exhaustive, got 'guess'"):
         LocalizationOptions(strategy="guess")
+
+
+def test_by_itself_it_matches_points_where_the_map_has_some_chosen_for_it(exact):
+    options = LocalizationOptions()
+    assert options.strategy == "auto"
+    assert options.strategy_for(exact) == "exhaustive"
+    chosen = describe_points(exact)
+    for map_ in (direct_map(exact, chosen), with_points(exact, exact, chosen)):
+        assert options.strategy_for(map_) == "direct"
+        assert LocalizationOptions(strategy="exhaustive").strategy_for(map_) == "exhaustive"
+    assert LocalizationOptions(strategy="direct").strategy_for(exact) == "direct"

@@ -15,7 +15,7 @@ from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import graph_of
 from slimsfm.graph.source import Edges
 from slimsfm.mapping.build import BuildOptions, build_map
-from slimsfm.mapping.io import read_map, write_map
+from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.photos import list_images
 from slimsfm.progress import shown
@@ -53,9 +53,15 @@ def benchmark_images(
     queries = held_out_queries(truth, images, names)
     prepared = prepare(references, queries, shown)
     with tempfile.TemporaryDirectory(prefix="slimsfm-benchmark-") as temporary:
-        store = maps_in(keep_maps or Path(temporary))
         result = benchmark(
-            references, graph, prepared, name=images.name, store=store, options=comparison, progress=shown
+            references,
+            graph,
+            prepared,
+            name=images.name,
+            store=maps_in(keep_maps or Path(temporary)),
+            weigh=weigh_map,
+            options=comparison,
+            progress=shown,
         )
     print_rows(result.rows)
     print_comparison(result.rows)

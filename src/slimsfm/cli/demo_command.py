@@ -18,7 +18,7 @@ from slimsfm.evaluation.protocol import PreparedQuery, errors_of, localize_all, 
 from slimsfm.execution import num_cores, processes
 from slimsfm.graph import GraphOptions, ReferenceGraph
 from slimsfm.graph.io import graph_of
-from slimsfm.mapping.io import read_map, write_map
+from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.photos import read_image
 from slimsfm.progress import shown
@@ -70,9 +70,16 @@ def _measure(one: ObjectSequences, folder: Path) -> tuple[ReferenceGraph, Benchm
     graph = graph_of(full, folder / "full-0", _GRAPH, progress=shown).graph
     queries = prepare(full, queries_of(one.query), shown)
     result = benchmark(
-        full, graph, queries, name=one.name, store=maps_in(folder), options=_COMPARISON, progress=shown
+        full,
+        graph,
+        queries,
+        name=one.name,
+        store=maps_in(folder),
+        weigh=weigh_map,
+        options=_COMPARISON,
+        progress=shown,
     )
-    reduced = read_map(folder / "dominating-0")
+    reduced = read_map(folder / "default-0")
     report = ObjectReport(
         name=one.name, full=full, reduced=reduced, rows=result.rows, frames=_frames(reduced, queries)
     )
@@ -82,7 +89,7 @@ def _measure(one: ObjectSequences, folder: Path) -> tuple[ReferenceGraph, Benchm
 def _frames(map: Map, queries: Sequence[PreparedQuery]) -> tuple[QueryFrame, ...]:
     """A few queries, evenly spaced, as the slim map localizes them."""
     chosen = queries[:: max(1, len(queries) // _FRAMES_SHOWN)][:_FRAMES_SHOWN]
-    found = localize_all(map, chosen, "exhaustive")
+    found = localize_all(map, chosen, "auto")
     return tuple(
         QueryFrame(
             image=read_image(prepared.query.path),

@@ -8,13 +8,12 @@ from typing import Annotated
 from slimsfm.cli.choices import frontier_to_json, print_frontier, promise
 from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.output import Flat, MapPath, Stopwatch, check_output, console, finish, parse
-from slimsfm.cli.results import weighing
 from slimsfm.errors import InputError
 from slimsfm.files import replacing
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import graph_of
 from slimsfm.graph.source import Edges
-from slimsfm.mapping.io import bytes_by_part, read_map
+from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map
 from slimsfm.mapping.map import check_has_features
 from slimsfm.progress import shown
 from slimsfm.reduction import FrontierOptions, frontier, recommend
@@ -54,9 +53,9 @@ def frontier_of(
     if "images" in comparison.uses:
         with resumable():
             graph = graph_of(full, map, GraphOptions(edges=edges), execution.open_executor(), shown).graph
-    with weighing() as weigh:
-        found = frontier(full, graph, weigh, comparison, shown)
-    recommended = {use: recommend(found, use) for use in comparison.uses}
+    found = frontier(full, graph, weigh_map, comparison, shown)
+    tried = {one.choice.use for one in found.candidates}
+    recommended = {use: recommend(found, use) for use in comparison.uses if use in tried}
     print_frontier(found, recommended, size)
     for use, one in recommended.items():
         console.print(f"for {use}: {one.choice.method}, {one.choice.detail}: {promise(map, full, one)}")

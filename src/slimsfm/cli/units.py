@@ -4,7 +4,7 @@ import re
 
 from slimsfm.errors import InputError
 
-_BYTES = {"": 1, "b": 1, "kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+_BYTES = {"": 1.0, "b": 1.0, "kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30}
 
 
 def parse_bytes(text: str, argument: str) -> float:
@@ -22,7 +22,7 @@ def parse_percent(text: str, argument: str) -> float:
     Raises:
         InputError: It is none.
     """
-    return _parse(text, argument, {"": 1, "%": 1}, "a percentage such as 1%")
+    return _parse(text, argument, {"": 1.0, "%": 1.0}, "a percentage such as 1%")
 
 
 def _parse(text: str, argument: str, units: dict[str, float], example: str) -> float:

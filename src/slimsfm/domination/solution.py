@@ -53,9 +53,14 @@ class Solution:
         return self.cost - self.lower_bound
 
     @property
+    def is_cheapest(self) -> bool:
+        """Whether it is proven that no set that leaves as few unmet costs less."""
+        return self.unmet == self.unmet_bound and self.gap == 0
+
+    @property
     def is_optimal(self) -> bool:
         """Whether it is proven that no set is better, in number of unmet, then cost, then error."""
-        return self.unmet == self.unmet_bound and self.gap == 0 and self.error == self.error_bound
+        return self.is_cheapest and self.error == self.error_bound
 
 
 @dataclass(frozen=True, kw_only=True)

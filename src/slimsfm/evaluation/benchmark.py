@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from slimsfm.domination import Solution
 from slimsfm.evaluation.protocol import PreparedQuery, evaluate
 from slimsfm.evaluation.table import Row, mean_row
-from slimsfm.evaluation.variants import VARIANTS
+from slimsfm.evaluation.variants import VARIANTS, Making
 from slimsfm.graph import ReferenceGraph
 from slimsfm.localization import STRATEGIES
 from slimsfm.mapping.map import Map
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction import ReductionOptions, dominating_set
+from slimsfm.reduction import ReductionOptions, Weigh, dominating_set
 
 StoredMap = tuple[Map, int]
 """A map as read from disk, and its size there in bytes."""
@@ -27,8 +27,9 @@ class BenchmarkOptions:
     strategies: tuple[str, ...] = ("exhaustive", "direct")
     """How queries are matched."""
 
-    variants: tuple[str, ...] = ("full", "dominating", "random")
-    """Which maps they are matched against; random ones have as many images as the dominating set."""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """Which maps they are matched against: all of it, a dominating set of images, what `slimsfm reduce` gives
+    by itself, and as many images as in the dominating set drawn at random."""
 
     reduction: ReductionOptions = ReductionOptions()
     """How the dominating set is chosen."""
@@ -61,23 +62,26 @@ def benchmark(
     *,
     name: str,
     store: Store,
+    weigh: Weigh,
     options: BenchmarkOptions = BenchmarkOptions(),
     progress: ProgressBar = silent,
 ) -> Benchmark:
     """Localize the same queries with every strategy against every variant of a map.
 
-    The row of a variant in which chance plays a part is the mean over five draws.
+    The row of a variant in which chance plays a part is the mean over five draws. A map for direct matching
+    alone has no row for other strategies.
     """
-    solution = dominating_set(graph, options.reduction)
+    solution = dominating_set(graph, options.reduction, map)
+    making = Making(map=map, solution=solution, weigh=weigh, progress=progress)
     stored = {
-        variant: [
-            store(one, f"{variant}-{draw}") for draw, one in enumerate(VARIANTS[variant](map, solution))
-        ]
+        variant: [store(one, f"{variant}-{draw}") for draw, one in enumerate(VARIANTS[variant](making))]
         for variant in options.variants
     }
     rows = []
     for strategy in options.strategies:
         for variant, maps in stored.items():
+            if strategy != "direct" and any(one.is_for_direct_matching for one, _ in maps):
+                continue
             draws = [
                 evaluate(one, queries, (name, strategy, variant), map_bytes=size, progress=progress)
                 for one, size in maps

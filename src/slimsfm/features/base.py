@@ -60,8 +60,9 @@ class Extractor(Protocol):
 def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
     """Make descriptors comparable by their dot product: rows of length 1 (a row of zeros stays one)."""
     rows = descriptors.astype(np.float32)
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows / np.maximum(lengths, np.float32(1e-12))
+    lengths = np.sqrt(np.einsum("nd,nd->n", rows, rows))
+    rows /= np.maximum(lengths, np.float32(1e-12))[:, None]
+    return rows
 
 
 def image_colors(

@@ -9,6 +9,7 @@ MAP/
 """
 
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxtyping import Float64
 
 from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
-from slimsfm.files import replacing
+from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
 from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
@@ -44,14 +45,15 @@ def read_map(path: Path) -> Map:
         )
         map_ = Map(
             model=model,
-            features=features or {},
+            features={} if features is None else features,
             matches=MatchFile(matches, names) if matches.exists() else {},
             point_descriptors=direct,
             info=info,
         )
         check_map(map_)
-        for name, image in map_.images.items() if features else ():
-            check_count(image, features.count(name))
+        if features is not None:
+            for name, image in map_.images.items():
+                check_count(image, features.count(name))
     except InputError as error:
         raise MapError(f"{path}: not a usable map: {error}") from error
     return map_
@@ -84,6 +86,16 @@ def _write_features(map: Map, path: Path) -> None:
             features = map.features[name]
             check_count(image, len(features))
             writer.write(name, features)
+
+
+def weigh_map(map: Map) -> int:
+    """Size in bytes that a map takes on disk, found by writing it to a temporary folder.
+
+    Interruptions are put off until the folder is gone again.
+    """
+    with uninterrupted(), tempfile.TemporaryDirectory(prefix="slimsfm-weigh-") as folder:
+        write_map(map, Path(folder) / "map")
+        return bytes_by_part(Path(folder) / "map")["total"]
 
 
 def bytes_by_part(path: Path) -> dict[str, int]:

@@ -81,6 +81,11 @@ class Map:
     """Extractor, box, unit and origin."""
 
     @property
+    def is_for_direct_matching(self) -> bool:
+        """Whether there are points to match but no image features."""
+        return not self.features and self.point_descriptors is not None
+
+    @property
     def box(self) -> Box:
         """The object's box in the map's frame."""
         return self.info.box
@@ -155,7 +160,7 @@ def check_map(map: Map) -> None:
         raise MapError(
             f"the map has {len(map.images)} images and {len(map.point3D_ids)} points; it needs both"
         )
-    if not map.features and map.point_descriptors is not None:
+    if map.is_for_direct_matching:
         return
     for name in map.images:
         if name not in map.features:
@@ -168,7 +173,7 @@ def check_has_features(map: Map) -> None:
     Raises:
         MapError: The map was made for direct matching alone.
     """
-    if not map.features and map.point_descriptors is not None:
+    if map.is_for_direct_matching:
         raise MapError(
             "the map is for direct matching alone: it holds points but no image features; "
             "use the map that it was made of"

@@ -6,6 +6,7 @@ saves.
 """
 
 import lzma
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -19,7 +20,10 @@ from slimsfm.features import unit_rows
 from slimsfm.mapping.map import PointDescriptors
 
 _LEVELS = 15
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, lzma.LZMAError)
+_UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError),
+    *(BadZipFile, RuntimeError, zlib.error, lzma.LZMAError),  # what zip and its parts raise
+)
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes have no context
 
 
@@ -79,7 +83,7 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
         InputError: The file is damaged, or of another model.
     """
     try:
-        with np.load(path) as file:
+        with path.open("rb") as opened, np.load(opened) as file:
             steps = np.frombuffer(lzma.decompress(file["points"].tobytes()), np.uint32)
             codes = np.frombuffer(lzma.decompress(file["codes"].tobytes()), np.uint8)
             (low, high), dimensions = file["range"].tolist(), int(file["dimensions"])

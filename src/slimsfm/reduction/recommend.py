@@ -6,7 +6,7 @@ from slimsfm.errors import InputError
 from slimsfm.reduction.choice import DOMINATING, Candidate
 from slimsfm.reduction.frontier import Frontier
 
-_RESERVE = 1.5  # times the points that just lose nothing
+_RESERVE = 2.0  # times the points that just lose nothing
 
 
 _LIMITS = ("max_loss", "max_bytes", "max_ms", "max_points", "max_images")
@@ -43,13 +43,13 @@ def recommend(frontier: Frontier, use: str, wish: Wish = Wish()) -> Candidate:
     """Take the smallest candidate that keeps to the wish.
 
     Without a largest loss, the smallest that loses nothing on the references gives way to one of its method
-    with half as many points again: queries are less like the references than those are like each other. Where
+    with twice as many points: queries are less like the references than those are like each other. Where
     every candidate loses something, the one that loses least is taken.
 
     Raises:
         InputError: No candidate keeps to the wish.
     """
-    usable = [one for one in frontier.candidates if one.choice.use == use and not _is_paper(one, use)]
+    usable = [one for one in frontier.candidates if one.choice.use == use and _is_usable(one)]
     fitting = [one for one in usable if _fits(one, wish)]
     if not fitting:
         raise InputError(_refusal(usable, use, wish))
@@ -60,9 +60,10 @@ def recommend(frontier: Frontier, use: str, wish: Wish = Wish()) -> Candidate:
     return _with_reserve(smallest, fitting)
 
 
-def _is_paper(one: Candidate, use: str) -> bool:
-    """Whether it is the points of a dominating set for direct matching: listed, but only to be compared."""
-    return use == "direct" and one.choice.method == DOMINATING
+def _is_usable(one: Candidate) -> bool:
+    """Whether it was tested, and is not the points of a dominating set: those are listed to be compared."""
+    choice = one.choice
+    return len(one.prediction.tests) > 0 and (choice.use, choice.method) != ("direct", DOMINATING)
 
 
 def _fits(one: Candidate, wish: Wish) -> bool:
@@ -76,7 +77,8 @@ def _fits(one: Candidate, wish: Wish) -> bool:
 
 
 def _size(one: Candidate) -> tuple[int, int, float]:
-    return one.bytes, len(one.choice.points), one.loss
+    """What is small goes first; of as many images and points, what is accurate."""
+    return len(one.choice.images), len(one.choice.points), one.prediction.median_error
 
 
 def _with_reserve(smallest: Candidate, fitting: list[Candidate]) -> Candidate:

@@ -1,8 +1,8 @@
 """What keeps the rim of a capture: sets of images of each of which one is to be kept.
 
 Stand at the object and look at the cameras around it. Where the capture ends, a query finds references on one
-side only, and if its neighbours there are localized from farther in, they are dropped and the query is left
-with nothing. So two things are asked for, as groups of a `DominationProblem`, at the cost of the fewest images:
+side only, and if those were localized from farther in, they are dropped and the query is left with nothing.
+So two things are asked for, as groups of a `DominationProblem`, which cost the fewest images:
 
 - a sector of the rim keeps an image that is nearly as far out as any in it;
 - a part of the object's surface keeps an image that sees much of it.
@@ -17,7 +17,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from slimsfm.geometry import Box
 from slimsfm.mapping.map import Map
@@ -69,26 +69,33 @@ def rim_sectors(directions: Directions, adjacency: csr_array) -> Iterator[Member
         directions: From the object to the cameras.
         adjacency: Entry [u, v] is true where image u localizes image v.
     """
-    localizes = adjacency.toarray().astype(bool)
-    angles = np.arccos(np.clip(directions @ directions.T, -1, 1))
-    within_reach = angles <= reach(angles, localizes)
+    dominators = csc_array(adjacency)
+    reach_deg = reach(directions, adjacency)
     for i, here in enumerate(directions):
-        ways = _ways(here, directions)
-        neighbours = np.flatnonzero((angles[i] <= np.radians(_NEAR_DEG)) & ways.any(axis=1))
+        angles_deg, ways = _angles_deg(directions, i), _ways(here, directions)
+        neighbours = np.flatnonzero((angles_deg <= _NEAR_DEG) & ways.any(axis=1))
+        localizes = np.zeros(len(directions), dtype=bool)
+        localizes[dominators.indices[dominators.indptr[i] : dominators.indptr[i + 1]]] = True
         for outward in _outward(ways[neighbours]):
-            far_out = angles[i] * (ways @ outward) >= -np.radians(_INWARD_DEG)
-            members = localizes[:, i] & within_reach[i] & far_out
+            members = localizes & (angles_deg <= reach_deg) & (angles_deg * (ways @ outward) >= -_INWARD_DEG)
             members[i] = True
             yield members
 
 
-def reach(angles: Float64[np.ndarray, "n n"], localizes: Bool[np.ndarray, "n n"]) -> float:
-    """The largest angle such that nine of ten pairs of images within it localize each other, in radians."""
-    pairs = ~np.eye(len(angles), dtype=bool)
-    order = np.argsort(angles[pairs], kind="stable")
-    share = np.cumsum(localizes[pairs][order]) / np.arange(1, len(order) + 1)
-    reliable = np.flatnonzero(share >= _RELIABLE)
-    return float(angles[pairs][order[reliable[-1]]]) if len(reliable) else 0.0
+def reach(directions: Directions, adjacency: csr_array) -> int:
+    """The most degrees such that nine of ten pairs of images within them localize each other; 0 if none."""
+    pairs, edges = np.zeros((2, 181))
+    for i in range(len(directions)):
+        degrees = np.ceil(_angles_deg(directions, i)).astype(np.int64)
+        others = adjacency.indices[adjacency.indptr[i] : adjacency.indptr[i + 1]]
+        pairs += np.bincount(np.delete(degrees, i), minlength=181)
+        edges += np.bincount(degrees[others[others != i]], minlength=181)
+    reliable = np.cumsum(edges) >= _RELIABLE * np.maximum(np.cumsum(pairs), 1)
+    return int(np.flatnonzero(reliable).max(initial=0))
+
+
+def _angles_deg(directions: Directions, i: int) -> Float64[np.ndarray, " n"]:
+    return np.degrees(np.arccos(np.clip(directions @ directions[i], -1, 1)))
 
 
 def _ways(here: np.ndarray, directions: Directions) -> Float64[np.ndarray, "n 2"]:

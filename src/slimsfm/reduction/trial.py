@@ -11,7 +11,7 @@ from functools import lru_cache
 from time import perf_counter
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
@@ -68,8 +68,8 @@ class Prediction:
         return float(np.median(self.errors)) if len(self.errors) else np.inf
 
 
-Target = tuple[Descriptors, Ids]
-"""Descriptors to match a query with, and the point of each."""
+Target = tuple[Float32[np.ndarray, "_ d"], Int64[np.ndarray, " _"]]
+"""Descriptors to match a query with, and the point of each; one target has more than another."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +169,7 @@ class Trials:
         row = names.index(name)
         others = slice(self._common.indptr[row], self._common.indptr[row + 1])
         images = self._common.indices[others]
-        best = np.argsort(-self._common.data[others], kind="stable")
+        best = np.argsort(np.negative(self._common.data[others]), kind="stable")
         nearest = [i for i in images[best] if i != row][:_MOST_REFERENCES]
         return [self._reference(names[i]) for i in nearest]
 

@@ -7,7 +7,8 @@ from math import ceil, floor, log10
 
 from slimsfm.reduction import Candidate, Frontier
 
-_WIDTH, _HEIGHT, _MARGIN = 420, 320, 56
+_WIDTH, _HEIGHT, _MARGIN = 420.0, 320.0, 56.0
+_MANY_DECADES = 4
 _COLORS = ("#0b6e99", "#c4501b", "#3d8b37", "#7a4fa3", "#8a6d00")
 
 
@@ -27,9 +28,10 @@ class _Axis:
 
     def ticks(self) -> list[float]:
         if self.logarithmic:
-            exponents = range(floor(log10(self.low)), ceil(log10(self.high)) + 1)
-            return [10.0**one for one in exponents if self.low <= 10.0**one <= self.high]
-        step = 10 ** floor(log10(max(self.high - self.low, 1e-12)))
+            decades = [10.0**one for one in range(floor(log10(self.low)), ceil(log10(self.high)) + 1)]
+            steps = (1, 2, 5) if len(decades) < _MANY_DECADES else (1,)
+            return [k * one for one in decades for k in steps if self.low <= k * one <= self.high]
+        step = 10.0 ** floor(log10(max(self.high - self.low, 1e-12)))
         return [step * one for one in range(ceil(self.low / step), floor(self.high / step) + 1)]
 
 
@@ -44,7 +46,7 @@ def draw_curves(frontier: Frontier, recommended: Mapping[str, Candidate], full_b
     chosen = list(recommended.values())
     charts = (
         ("points lost against the full map (%)", lambda one: one.loss, False),
-        ("matching + pose a query (ms)", lambda one: 1e3 * one.seconds, True),
+        ("matching + pose a query (ms)", lambda one: max(1e3 * one.seconds, 1e-3), True),
     )
     drawn = [
         f'<g transform="translate({number * _WIDTH} 0)">'
@@ -73,10 +75,10 @@ def _chart(
         (min(values) / 1.3, max(values) * 1.3) if logarithmic else (min(0.0, *values), max(values) + 1)
     )
     x = _Axis(low=min(sizes) / 1.3, high=1.3 * full_bytes, start=_MARGIN, end=_WIDTH - 12, logarithmic=True)
-    y = _Axis(low=low, high=high, start=_HEIGHT - 36, end=28, logarithmic=logarithmic)
+    y = _Axis(low=low, high=high, start=_HEIGHT - 36, end=28.0, logarithmic=logarithmic)
     parts = [f'<text x="{_MARGIN}" y="16" font-weight="bold">{title}</text>', _grid(x, y)]
     for series, color in _series(frontier):
-        places = [(x.at(one.bytes), y.at(value(one))) for one in series]
+        places = [(x.at(float(one.bytes)), y.at(value(one))) for one in series]
         line = " ".join(f"{a:.1f},{b:.1f}" for a, b in places)
         parts.append(f'<polyline points="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
         for one, (a, b) in zip(series, places, strict=True):

@@ -21,8 +21,10 @@ def size(num_bytes: float | int) -> str:
 
 def contents(map: Map) -> str:
     """How much a map holds."""
-    images, points = len(map.images), len(map.point3D_ids)
-    return f"{number(images)} image{'s' * (images != 1)}, {number(points)} points"
+    images, points = len(map.images), f"{number(len(map.point3D_ids))} points"
+    if map.is_for_direct_matching:
+        return points
+    return f"{number(images)} image{'s' * (images != 1)}, {points}"
 
 
 def headline(full: Map, reduced: Map, rows: Sequence[Row]) -> str:
@@ -42,12 +44,17 @@ def headline(full: Map, reduced: Map, rows: Sequence[Row]) -> str:
 
 
 def compared(rows: Sequence[Row]) -> tuple[Row, Row] | None:
-    """The full map's row and that of the dominating images under the same strategy, or None."""
-    for before in rows:
-        for after in rows:
-            variants = before.variant, after.variant
-            if variants == ("full", "dominating") and before.strategy == after.strategy:
-                return before, after
+    """The full map's row and that of the slim map, or None.
+
+    What `slimsfm reduce` gives by itself, for direct matching, stands against the full map matched
+    exhaustively; where it was not measured, dominating images against the full map under the same strategy.
+    """
+    by_label = {(row.strategy, row.variant): row for row in rows}
+    pairs = [(("exhaustive", "full"), ("direct", "default"))]
+    pairs += [((row.strategy, "full"), (row.strategy, "dominating")) for row in rows]
+    for before, after in pairs:
+        if before in by_label and after in by_label:
+            return by_label[before], by_label[after]
     return None
 
 

@@ -64,8 +64,9 @@ def _points_near(map: Map) -> list[Ids]:
     near = []
     for row in range(len(map.images)):
         others = slice(common.indptr[row], common.indptr[row + 1])
-        best = np.argsort(-common.data[others], kind="stable")[: _NEIGHBOURS + 1]  # itself among them
-        near.append(np.unique(sees[common.indices[others][best]].indices).astype(np.int64))
+        best = np.argsort(np.negative(common.data[others]), kind="stable")
+        images = common.indices[others][best][: _NEIGHBOURS + 1]  # itself among them
+        near.append(np.unique(sees[images].indices).astype(np.int64))
     return near
 
 

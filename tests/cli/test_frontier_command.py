@@ -1,0 +1,108 @@
+"""`slimsfm frontier`: a table, JSON and curves of what a map can be reduced to."""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from commands import contents, slimsfm
+from rendered import MAPPING_FRAMES
+from slimsfm.mapping.io import bytes_by_part, write_map
+
+FEW = ("--budgets", 50, 200, "--selectors", "kcover", "--dominators", 1)
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def drawn(boulder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frontier")
+    json_path, curves = folder / "frontier.json", folder / "curves.svg"
+    done = slimsfm("frontier", boulder.map_path, *FEW, "--json", json_path, "--curves", curves)
+    assert (done.code, done.err.strip()) == (0, "")
+    return done.out, json.loads(json_path.read_text()), curves.read_text()
+
+
+@pytest.fixture
+def exact_path(exact, tmp_path) -> Path:
+    write_map(exact, tmp_path / "map")
+    return tmp_path / "map"
+
+
+def test_the_table_lists_every_way_and_recommends_one_a_use(boulder, drawn):
+    out, data, _ = drawn
+    lines = out.splitlines()
+    assert lines[0].split()[:3] == ["for", "method", "asked"]
+    assert lines[1].split()[:2] == ["full", "map"]
+    ways = [line for line in lines if line.startswith(("direct ", "images "))]
+    assert len(ways) == len(data["candidates"])
+    assert sum(line.rstrip().endswith("recommended") for line in ways) == 2
+    assert sum(line.startswith(("for direct: kcover", "for images: dominating")) for line in lines) == 2
+    assert lines[-2].startswith(f"{len(ways)} ways to reduce {boulder.map_path} in ")
+    assert lines[-1].startswith(f"next: slimsfm reduce {boulder.map_path} ")
+
+
+def test_the_figures_say_what_the_table_says(boulder, drawn):
+    _, data, _ = drawn
+    full, candidates = data["full"], data["candidates"]
+    assert full["images"] == full["tests"] == MAPPING_FRAMES
+    assert full["points"] == len(boulder.map.point3D_ids)
+    assert full["bytes"] == bytes_by_part(boulder.map_path)["total"]
+    by_points = [one for one in candidates if (one["for"], one["method"]) == ("direct", "kcover")]
+    assert [one["points"] for one in by_points] == [50, 200]
+    assert by_points[0]["bytes"] < by_points[1]["bytes"] < full["bytes"]
+    for use in ("direct", "images"):
+        (best,) = [one for one in candidates if one["for"] == use and one["recommended"]]
+        assert (use, best["method"]) in {("direct", "kcover"), ("images", "dominating")}
+        assert any(one["for"] == use and not one["dominated"] for one in candidates)
+    for one in candidates:
+        assert bool(one["images"]) == (one["for"] == "images")
+        assert one["tests"] == MAPPING_FRAMES - len(one["images"])
+        assert 0 <= one["add_0.02d"] <= one["add_0.05d"] <= one["add_0.1d"] <= 100
+        assert one["ms"] > 0
+
+
+def test_the_curves_show_every_way_twice(drawn):
+    _, data, curves = drawn
+    root = ElementTree.fromstring(curves)
+    assert root.tag == f"{SVG}svg"
+    circles = list(root.iter(f"{SVG}circle"))
+    assert sum(circle.get("r") == "2.5" for circle in circles) == 2 * len(data["candidates"])
+    assert sum(circle.get("r") == "7" for circle in circles) == 2 * 2
+    assert len(list(root.iter(f"{SVG}polyline"))) == 2 * 3
+    said = " ".join(text.text for text in root.iter(f"{SVG}text"))
+    for words in ("direct: kcover", "direct: dominating", "images: dominating", "recommended"):
+        assert words in said
+    width, height = map(float, root.get("viewBox").split()[2:])
+    for circle in circles:
+        assert 0 <= float(circle.get("cx")) <= width
+        assert 0 <= float(circle.get("cy")) <= height
+
+
+def test_it_changes_nothing_but_for_a_graph_that_is_kept(exact_path):
+    before = contents(exact_path)
+    done = slimsfm("frontier", exact_path, "--budgets", 30, "--uses", "direct", "--selectors", "random")
+    assert done.code == 0, done.err
+    assert contents(exact_path) == before
+    assert slimsfm("frontier", exact_path, *FEW).code == 0
+    assert set(contents(exact_path)) - set(before) == {"graph-matches.npz"}
+
+
+def test_what_is_there_is_replaced_where_asked(exact_path, tmp_path):
+    taken = tmp_path / "frontier.json"
+    taken.write_text("mine")
+    command = ("frontier", exact_path, "--uses", "direct", *FEW, "--json", taken)
+    refusal = slimsfm(*command)
+    assert (refusal.code, taken.read_text()) == (2, "mine")
+    assert str(taken) in refusal.err
+    assert slimsfm(*command, "--overwrite").code == 0
+    assert json.loads(taken.read_text())["full"]["images"] == 6
+
+
+def test_files_never_replace_the_map(exact_path):
+    before = contents(exact_path)
+    for option in ("--json", "--curves"):
+        refusal = slimsfm("frontier", exact_path, option, exact_path, "--overwrite")
+        assert refusal.code == 2
+        assert str(exact_path) in refusal.err
+    assert contents(exact_path) == before

@@ -1,0 +1,190 @@
+"""Maps for direct matching."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from scenes import camera, exact_map
+from slimsfm.errors import MapError
+from slimsfm.features import unit_rows
+from slimsfm.geometry import corner_error
+from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute_graph
+from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.localization.direct import describe_points
+from slimsfm.mapping.direct import direct_map, with_points
+from slimsfm.mapping.io import bytes_by_part, read_map, write_map
+from slimsfm.mapping.map import PointDescriptors, check_map
+from slimsfm.mapping.subset import keep_images
+from slimsfm.reduction import FrontierOptions, frontier
+
+HALF_A_STEP = 0.5 / 15  # of the range between the smallest and the largest value
+
+
+def described(map_, rows):
+    rows = np.asarray(rows, np.int64)
+    return PointDescriptors(points=rows, descriptors=describe_points(map_).descriptors[rows])
+
+
+@pytest.fixture(scope="module")
+def chosen(exact):
+    return described(exact, np.arange(0, len(exact.point3D_ids), 3))
+
+
+@pytest.fixture(scope="module")
+def direct(exact, chosen):
+    return direct_map(exact, chosen)
+
+
+@pytest.fixture(scope="module")
+def partial():
+    """A map whose images see half of the points each."""
+    return exact_map(8, 60, reach_deg=80)
+
+
+def test_chosen_points_stay_as_they_were(exact, chosen, direct):
+    check_map(direct)
+    assert np.array_equal(direct.point3D_ids, exact.point3D_ids[chosen.points])
+    assert np.array_equal(direct.points3D_in_world, exact.points3D_in_world[chosen.points])
+    assert np.array_equal(direct.colors, exact.colors[chosen.points])
+    assert np.array_equal(direct.point_descriptors.points, np.arange(len(chosen.points)))
+    assert np.array_equal(direct.point_descriptors.descriptors, chosen.descriptors)
+
+
+def test_images_keep_their_poses_and_nothing_to_match_them_by(exact, direct):
+    assert list(direct.images) == list(exact.images)
+    for name, image in direct.images.items():
+        before = exact.images[name]
+        assert (image.image_id, image.camera_id) == (before.image_id, before.camera_id)
+        assert np.array_equal(image.cam_from_world().matrix(), before.cam_from_world().matrix())
+        assert repr(direct.camera(name)) == repr(exact.camera(name))
+        assert image.num_points2D() == 0
+    assert all(point.track.length() == 0 for point in direct.model.points3D.values())
+    assert (len(direct.features), len(direct.matches)) == (0, 0)
+    assert direct.info is exact.info
+
+
+def test_the_map_it_is_made_of_stays_whole(exact, chosen):
+    before = exact.fingerprint
+    direct_map(exact, chosen)
+    assert replace(exact).fingerprint == before
+
+
+def test_it_is_read_as_it_was_written_but_for_rounding(direct, tmp_path):
+    write_map(direct, tmp_path / "map")
+    assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["map.json", "points.npz", "sparse"]
+    again = read_map(tmp_path / "map")
+    assert list(again.images) == list(direct.images)
+    for name, image in again.images.items():
+        pose = direct.images[name].cam_from_world().matrix()
+        assert np.array_equal(image.cam_from_world().matrix(), pose)
+    assert np.array_equal(again.point3D_ids, direct.point3D_ids)
+    assert np.array_equal(again.points3D_in_world, direct.points3D_in_world)
+    assert np.array_equal(again.point_descriptors.points, direct.point_descriptors.points)
+    before, after = direct.point_descriptors.descriptors, again.point_descriptors.descriptors
+    assert np.linalg.norm(after, axis=1) == pytest.approx(np.ones(len(after)))
+    assert (after * before).sum(axis=1).min() > 0.98
+
+
+def test_equal_maps_are_equal_files_however_often_they_are_written(direct, tmp_path):
+    for name in ("one", "two"):
+        write_map(direct, tmp_path / name)
+    write_map(read_map(tmp_path / "one"), tmp_path / "copy")
+    for file in (path for path in (tmp_path / "one").rglob("*") if path.is_file()):
+        place = file.relative_to(tmp_path / "one")
+        assert file.read_bytes() == (tmp_path / "two" / place).read_bytes()
+        if file.name != "points.npz":
+            assert file.read_bytes() == (tmp_path / "copy" / place).read_bytes()
+
+
+def test_its_size_is_that_of_its_parts(exact, direct, tmp_path):
+    write_map(exact, tmp_path / "full")
+    write_map(direct, tmp_path / "direct")
+    sizes = bytes_by_part(tmp_path / "direct")
+    assert list(sizes) == ["map.json", "points.npz", "sparse", "total"]
+    assert sizes["total"] == sum(size for part, size in sizes.items() if part != "total")
+    assert sizes["total"] < bytes_by_part(tmp_path / "full")["total"] / 5
+
+
+def test_the_model_opens_in_pycolmap(direct, tmp_path):
+    write_map(direct, tmp_path / "map")
+    model = pycolmap.Reconstruction(tmp_path / "map" / "sparse")
+    assert model.num_reg_images() == len(direct.images)
+    assert model.num_points3D() == len(direct.point3D_ids)
+    assert model.compute_num_observations() == 0
+
+
+def test_a_map_without_chosen_points_is_read_as_ever(exact, tmp_path):
+    write_map(exact, tmp_path / "map")
+    assert not (tmp_path / "map" / "points.npz").exists()
+    again = read_map(tmp_path / "map")
+    assert again.point_descriptors is None
+    assert len(again.features) == len(exact.features)
+
+
+@pytest.mark.parametrize("strategy", ["auto", "direct"])
+def test_references_are_localized_where_they_are(direct, exact, tmp_path, strategy):
+    write_map(direct, tmp_path / "map")
+    for map_ in (direct, read_map(tmp_path / "map")):
+        localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
+        for name, image in exact.images.items():
+            found = localizer.localize_features(exact.features[name], camera()).pose
+            assert found.num_inliers == len(direct.point3D_ids)
+            assert corner_error(found.cam_from_world, image.cam_from_world(), exact.box) < 1e-4
+
+
+def test_points_added_to_some_images_serve_both_ways(partial, tmp_path):
+    names = list(partial.images)[:2]
+    slim = keep_images(partial, names)
+    chosen = described(partial, np.arange(1, len(partial.point3D_ids), 2))
+    both = with_points(slim, partial, chosen)
+    write_map(both, tmp_path / "map")
+    wanted = partial.point3D_ids[chosen.points]
+    assert set(both.point3D_ids) == set(wanted) | set(slim.point3D_ids) > set(slim.point3D_ids)
+    for map_ in (both, read_map(tmp_path / "map")):
+        assert list(map_.images) == names
+        assert map_.model.is_valid()
+        assert np.array_equal(map_.point3D_ids[map_.point_descriptors.points], wanted)
+        for name in names:
+            seen, before = map_.observations[name], slim.observations[name]
+            assert np.array_equal(seen.rows, before.rows)
+            assert np.array_equal(map_.point3D_ids[seen.points], slim.point3D_ids[before.points])
+            for strategy in ("exhaustive", "direct"):
+                localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
+                found = localizer.localize_features(partial.features[name], camera()).pose
+                truth = partial.images[name].cam_from_world()
+                assert corner_error(found.cam_from_world, truth, partial.box) < 1e-3
+    assert slim.model.num_points3D() == len(slim.point3D_ids)
+
+
+def test_what_is_kept_of_a_map_for_both_is_for_images_again(partial):
+    names = list(partial.images)
+    both = with_points(keep_images(partial, names), partial, described(partial, [0, 5]))
+    assert keep_images(both, names[:3]).point_descriptors is None
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        *(
+            lambda map_, one=one: compute_graph(map_, GraphOptions(edges=one))
+            for one in ("auto", *EDGE_SOURCES)
+        ),
+        lambda map_: Localizer(map_, LocalizationOptions(strategy="exhaustive")),
+        lambda map_: keep_images(map_, list(map_.images)[:2]),
+        lambda map_: frontier(map_, None, lambda _: 0, FrontierOptions(uses=("direct",))),
+    ],
+    ids=["auto", *EDGE_SOURCES, "exhaustive", "keep_images", "frontier"],
+)
+def test_what_needs_features_says_which_map_has_them(direct, use):
+    with pytest.raises(MapError, match=r"direct matching alone.*use the map that it was made of"):
+        use(direct)
+
+
+def test_descriptors_need_not_be_of_unit_length_to_be_written(exact, chosen, tmp_path):
+    longer = replace(chosen, descriptors=7 * chosen.descriptors)
+    write_map(direct_map(exact, longer), tmp_path / "map")
+    read = read_map(tmp_path / "map").point_descriptors.descriptors
+    assert read == pytest.approx(unit_rows(read))
+    assert (read * chosen.descriptors).sum(axis=1).min() > 1 - HALF_A_STEP

@@ -1,0 +1,212 @@
+"""Which candidate is taken."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from candidates import MISSED, candidate, frontier_of
+from slimsfm.errors import InputError
+from slimsfm.reduction import Wish, recommend
+
+CANDIDATES = st.lists(  # what they are made of
+    st.fixed_dictionaries(
+        {
+            "use": st.sampled_from(["direct", "images"]),
+            "method": st.sampled_from(["kcover", "information", "dominating"]),
+            "points": st.integers(1, 60),
+            "images": st.integers(0, 4),
+            "size": st.integers(1, 12),
+            "missed": st.integers(-MISSED, 6),
+            "ms": st.integers(1, 9).map(float),
+            "error": st.sampled_from([0.001, 0.002]),
+        }
+    ),
+    min_size=1,
+    max_size=8,
+)
+RESERVE = 2  # times the points that just lose nothing
+USES = st.sampled_from(["direct", "images"])
+
+
+def made(facts):
+    return [candidate(**one) for one in facts]
+
+
+def maybe(values):
+    return st.none() | values
+
+
+WISHES = st.builds(
+    Wish,
+    max_loss=maybe(st.integers(0, 30).map(float)),
+    max_bytes=maybe(st.integers(1, 12).map(float)),
+    max_ms=maybe(st.integers(1, 9).map(float)),
+    max_points=maybe(st.integers(1, 60)),
+    max_images=maybe(st.integers(0, 4)),
+)
+
+
+def keeps_to(one, wish):
+    found = {
+        "max_loss": one.loss,
+        "max_bytes": one.bytes,
+        "max_ms": 1e3 * one.seconds,
+        "max_points": len(one.choice.points),
+        "max_images": len(one.choice.images),
+    }
+    return all(getattr(wish, name) is None or value <= getattr(wish, name) for name, value in found.items())
+
+
+def size(one):
+    """What is smaller has fewer images, then fewer points; of equals the more accurate goes first."""
+    return len(one.choice.images), len(one.choice.points), one.prediction.median_error
+
+
+def may_be_taken(one, use):
+    return one.choice.use == use and (use, one.choice.method) != ("direct", "dominating")
+
+
+@given(facts=CANDIDATES, use=USES, wish=WISHES)
+def test_what_is_taken_keeps_to_every_wish_or_there_is_nothing_that_does(facts, use, wish):
+    candidates = made(facts)
+    fitting = [one for one in candidates if may_be_taken(one, use) and keeps_to(one, wish)]
+    if not fitting:
+        with pytest.raises(InputError, match=f"for {use}"):
+            recommend(frontier_of(*candidates), use, wish)
+        return
+    taken = recommend(frontier_of(*candidates), use, wish)
+    assert any(taken is one for one in fitting)
+    if wish.max_loss is not None:
+        assert size(taken) == min(size(one) for one in fitting)
+
+
+@given(facts=CANDIDATES, use=USES, wish=WISHES)
+def test_without_a_largest_loss_the_smallest_of_least_loss_is_taken_or_one_twice_as_large(facts, use, wish):
+    candidates = made(facts)
+    wish = replace(wish, max_loss=None)
+    fitting = [one for one in candidates if may_be_taken(one, use) and keeps_to(one, wish)]
+    assume(fitting)
+    taken = recommend(frontier_of(*candidates), use, wish)
+    allowed = max(min(one.loss for one in fitting), 0.0)
+    smallest = [one for one in fitting if one.loss <= allowed]
+    least = min(size(one) for one in smallest)
+    assert any(
+        taken is one
+        or (
+            use == "direct"
+            and taken.choice.method == one.choice.method
+            and len(taken.choice.points) >= RESERVE * len(one.choice.points)
+        )
+        for one in smallest
+        if size(one) == least
+    )
+
+
+@given(facts=CANDIDATES, use=USES, wish=WISHES, seed=st.randoms(use_true_random=False))
+def test_the_order_of_the_candidates_does_not_matter(facts, use, wish, seed):
+    candidates = made(facts)
+    keys = {size(one) for one in candidates}
+    assume(len(keys) == len(candidates))
+    assume(any(may_be_taken(one, use) and keeps_to(one, wish) for one in candidates))
+    shuffled = list(candidates)
+    seed.shuffle(shuffled)
+    taken = recommend(frontier_of(*candidates), use, wish)
+    assert recommend(frontier_of(*shuffled), use, wish) is taken
+
+
+def test_losses_are_points_lost_against_the_full_map():
+    assert candidate(missed=2).losses == pytest.approx((10.0, 10.0, 10.0))
+    assert candidate(missed=-2).loss == pytest.approx(-10.0)
+    assert candidate(missed=0).loss == 0.0
+
+
+def test_the_reserve_is_twice_as_many_points_by_the_same_method():
+    small = candidate(points=100, size=1000)
+    larger = candidate(points=199, size=1990)
+    enough = candidate(points=200, size=2000, missed=1)
+    more = candidate(points=300, size=3000)
+    other = candidate(points=200, size=1900, method="information")
+    found = frontier_of(small, larger, enough, more, other)
+    assert recommend(found, "direct") is enough
+    assert recommend(found, "direct", Wish(max_loss=0.0)) is small
+    assert recommend(found, "direct", Wish(max_bytes=1999.0)) is small
+    assert recommend(found, "direct", Wish(max_points=199)) is small
+    assert recommend(frontier_of(small, larger, more, other), "direct") is more
+
+
+def test_of_as_many_points_those_of_the_least_error_are_taken():
+    one, two = candidate(error=0.002, size=990), candidate(error=0.001, method="information")
+    assert recommend(frontier_of(one, two), "direct") is two
+    assert recommend(frontier_of(one, two), "direct", Wish(max_loss=0.0)) is two
+
+
+def test_images_need_no_reserve():
+    small = candidate(use="images", method="dominating", points=100, images=2, size=1000)
+    more = candidate(use="images", method="dominating", points=200, images=5, size=2000)
+    assert recommend(frontier_of(small, more), "images") is small
+
+
+def test_what_loses_least_is_taken_where_everything_loses():
+    bad = candidate(points=100, size=1000, missed=6)
+    better = candidate(points=120, size=1200, missed=3)
+    assert recommend(frontier_of(bad, better), "direct") is better
+
+
+def test_a_gain_is_not_sought():
+    enough = candidate(size=1000, missed=0)
+    gain = candidate(points=120, size=1200, missed=-2)
+    assert recommend(frontier_of(enough, gain), "direct") is enough
+
+
+def test_points_of_a_dominating_set_are_only_compared_with():
+    paper = candidate(method="dominating", size=10)
+    ours = candidate(size=1000, missed=6)
+    assert recommend(frontier_of(paper, ours), "direct") is ours
+    with pytest.raises(InputError, match="no way to reduce this map for direct"):
+        recommend(frontier_of(paper), "direct")
+
+
+def test_a_refusal_says_what_can_be_had():
+    found = frontier_of(
+        candidate(points=100, size=1234, missed=6, ms=3.0), candidate(points=200, size=5678, missed=1, ms=7.0)
+    )
+    with pytest.raises(InputError) as refusal:
+        recommend(found, "direct", Wish(max_bytes=1000.0, max_loss=2.0))
+    message = str(refusal.value)
+    for words in ("max-loss 2, max-bytes 1000", "5.0 % with 5678 bytes", "has 1234 bytes", "takes 3 ms"):
+        assert words in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("name", ["max_loss", "max_bytes", "max_ms", "max_points", "max_images"])
+def test_limits_are_not_negative(name):
+    below = -1 if name in ("max_points", "max_images") else -1.0
+    with pytest.raises(ValueError, match=f"{name} must not be negative, got -1"):
+        Wish(**{name: below})
+
+
+@given(facts=CANDIDATES)
+def test_the_undominated_dominate_all_others(facts):
+    candidates = made(facts)
+    found = frontier_of(*candidates)
+    best = [one for one in candidates if not found.is_dominated(one)]
+    for one in candidates:
+        better = [
+            other
+            for other in best
+            if other.choice.use == one.choice.use
+            and other.bytes <= one.bytes
+            and other.loss <= one.loss
+            and (other.bytes < one.bytes or other.loss < one.loss)
+        ]
+        assert found.is_dominated(one) == bool(better)
+    assert {one.choice.use for one in best} == {one.choice.use for one in candidates}
+
+
+@given(facts=CANDIDATES)
+def test_nothing_dominates_itself_or_its_equal(facts):
+    for one in made(facts):
+        assert not frontier_of(one).is_dominated(one)
+        assert not frontier_of(one, replace(one)).is_dominated(one)

@@ -1,0 +1,169 @@
+"""References that are left out foretell queries."""
+
+from dataclasses import replace
+from itertools import count, pairwise
+
+import numpy as np
+import pytest
+
+from scenes import exact_map
+from slimsfm.features import unit_rows
+from slimsfm.pose import RansacOptions
+from slimsfm.reduction import Prediction, Trials, trial
+from slimsfm.selection.left_out import LeftOut
+
+LOST_AT_MOST = 0.5
+
+
+def trials_of(map_):
+    return Trials(map_, LeftOut(map_))
+
+
+def rows_of(map_):
+    return np.arange(len(map_.point3D_ids))
+
+
+@pytest.fixture(scope="module")
+def partial():
+    """Ten images that see half of the points each."""
+    return exact_map(10, 200, reach_deg=80)
+
+
+@pytest.fixture(scope="module")
+def strangers(exact):
+    """The exact scene with descriptors that no two images agree on."""
+    rng = np.random.default_rng(0)
+    features = {
+        name: replace(one, descriptors=unit_rows(rng.normal(size=one.descriptors.shape)))
+        for name, one in exact.features.items()
+    }
+    return replace(exact, features=features)
+
+
+@pytest.fixture
+def ticking(monkeypatch):
+    """A clock by which every stage of every test takes one second."""
+    ticks = count()
+    monkeypatch.setattr(trial, "perf_counter", lambda: float(next(ticks)))
+
+
+def prediction(errors, inliers=None):
+    return Prediction(
+        tests=tuple(f"{i}.png" for i in range(len(errors))),
+        errors=np.array(errors, np.float64),
+        inliers=np.array(inliers if inliers is not None else [9] * len(errors), np.int64),
+        seconds=0.5,
+    )
+
+
+def test_shares_count_errors_below_a_fraction():
+    found = prediction([0.0, 0.01, 0.02, np.inf])
+    assert [found.within(one) for one in (0.005, 0.02, 0.03)] == [25.0, 50.0, 75.0]
+    assert found.median_error == pytest.approx(0.015)
+    assert prediction([np.inf, np.inf, 0.1]).median_error == np.inf
+
+
+def test_the_part_of_some_tests_is_theirs():
+    found = prediction([0.1, 0.2, 0.3], [5, 6, 7])
+    part = found.of({"2.png", "0.png", "nobody.png"})
+    assert part.tests == ("0.png", "2.png")
+    assert part.errors.tolist() == [0.1, 0.3]
+    assert part.inliers.tolist() == [5, 7]
+    assert part.seconds == found.seconds
+    assert found.of(found.tests).errors.tolist() == found.errors.tolist()
+
+
+def test_no_tests_tell_nothing():
+    nothing = prediction([0.1]).of(())
+    assert nothing.tests == ()
+    assert nothing.within(0.1) == 0.0
+    assert nothing.median_error == np.inf
+
+
+def test_on_an_exact_scene_nothing_is_off(exact):
+    trials, names = trials_of(exact), list(exact.images)
+    assert trials.tests == tuple(names)
+    by_points, by_images = trials.points(rows_of(exact)), trials.images(names[:2])
+    everything = trials.full(names)
+    assert by_points.tests == everything.tests == tuple(names)
+    assert by_images.tests == tuple(names[2:])
+    for found in (by_points, by_images, everything):
+        assert found.errors.max() < 1e-4
+        assert found.within(0.02) == 100.0
+        assert found.inliers.min() >= (LOST_AT_MOST - 0.15) * len(exact.point3D_ids)
+        assert found.seconds > 0
+
+
+def test_a_reference_does_not_help_to_localize_itself(strangers):
+    trials = trials_of(strangers)
+    for found in (trials.points(rows_of(strangers)), trials.full(trials.tests)):
+        assert found.inliers.tolist() == [0] * len(trials.tests)
+        assert found.within(1e9) == 0.0
+
+
+@pytest.mark.usefixtures("ticking")
+def test_only_some_are_left_out_where_there_are_many():
+    many = exact_map(70, 30)
+    trials, names = trials_of(many), list(many.images)
+    assert len(set(trials.tests)) == 60
+    assert list(trials.tests) == sorted(trials.tests)
+    assert (trials.tests[0], trials.tests[-1]) == (names[0], names[-1])
+    by_images = trials.images(names[:30]).tests
+    assert set(by_images) == set(trials.tests) - set(names[:30])
+    assert trials.points(rows_of(many)).seconds == 2
+    assert trials.full(trials.tests[:3]).seconds == pytest.approx(2 * 69 / 60)
+
+
+@pytest.mark.usefixtures("ticking")
+def test_the_time_of_a_full_map_is_measured_where_images_are_few(exact):
+    assert trials_of(exact).full(list(exact.images)[:2]).seconds == 2
+
+
+def test_equal_maps_give_equal_predictions(partial):
+    rows = rows_of(partial)[::2]
+    one, two = trials_of(partial), trials_of(partial)
+    two.points(rows_of(partial))  # what was asked before does not matter
+    names = list(partial.images)[:3]
+    for a, b in (
+        (one.points(rows), two.points(rows)),
+        (one.images(names), two.images(names[::-1])),
+        (one.full(one.tests), two.full(two.tests)),
+    ):
+        assert a.tests == b.tests
+        assert np.array_equal(a.errors, b.errors)
+        assert np.array_equal(a.inliers, b.inliers)
+
+
+def test_fewer_points_give_no_more_inliers(partial):
+    rng, trials = np.random.default_rng(0), trials_of(partial)
+    order = rng.permutation(rows_of(partial))
+    means = [trials.points(np.sort(order[:size])).inliers.mean() for size in (200, 120, 70, 40, 20)]
+    assert all(more > fewer for more, fewer in pairwise(means))
+
+
+def test_points_that_nobody_sees_localize_nobody(exact):
+    found = trials_of(exact).points(np.array([3, 4, 5]))
+    assert found.inliers.tolist() == [0] * len(exact.images)
+    assert np.isinf(found.errors).all()
+
+
+def matches_of(map_, name, off_px):
+    """Every observation of an image, shifted."""
+    seen = map_.observations[name]
+    keypoints = map_.features[name].keypoints[seen.rows].astype(np.float64)
+    return keypoints + np.array([off_px, 0.0]), map_.points3D_in_world[seen.points]
+
+
+def test_wrong_matches_are_all_kept(partial):
+    trials = trials_of(partial)
+    for name in partial.images:
+        assert trials._handicap(name, *matches_of(partial, name, 2 * RansacOptions().max_error_px)).all()
+
+
+def test_of_right_matches_half_are_lost_at_most_on_average():
+    trials = trials_of(many := exact_map(40, 400))
+    kept = np.array([trials._handicap(name, *matches_of(many, name, 0.0)).mean() for name in trials.tests])
+    assert kept[0] == 1.0
+    assert kept.min() > LOST_AT_MOST - 0.1
+    assert kept.mean() == pytest.approx(1 - LOST_AT_MOST / 2, abs=0.03)
+    assert np.histogram(kept, bins=[0, 0.625, 0.75, 0.875, 1])[0].min() >= 6
