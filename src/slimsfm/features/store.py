@@ -185,13 +185,15 @@ def write_matches(
 def _create(path: Path) -> Iterator[h5py.File]:
     path.unlink(missing_ok=True)  # who still reads an older file keeps it
     with _PatientFile(path, "w+b") as raw:
-        with uninterrupted():
-            file = h5py.File(raw, "w", libver="latest")
+        file = None
         try:
+            with uninterrupted():
+                file = h5py.File(raw, "w", libver="latest")
             yield file
         finally:
             with uninterrupted():
-                file.close()
+                if file is not None:  # an interruption that was put off comes before it is handed out
+                    file.close()
         if raw.failure:
             raise raw.failure
 
