@@ -16,14 +16,14 @@ from slimsfm.graph.source import Edges
 from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map
 from slimsfm.mapping.map import check_has_features
 from slimsfm.progress import shown
-from slimsfm.reduction import FrontierOptions, frontier, recommend
+from slimsfm.reduction import USES, FrontierOptions, frontier, recommend
 from slimsfm.report.curves import draw_curves
 
 
 def frontier_of(
     map: MapPath,
     /,
-    comparison: Annotated[FrontierOptions, Flat] = FrontierOptions(),
+    comparison: Annotated[FrontierOptions, Flat] = FrontierOptions(uses=USES),
     edges: Edges = "auto",
     json: Path | None = None,
     curves: Path | None = None,

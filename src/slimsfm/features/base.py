@@ -57,9 +57,17 @@ class Extractor(Protocol):
         ...
 
 
-def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
-    """Make descriptors comparable by their dot product: rows of length 1 (a row of zeros stays one)."""
-    rows = descriptors.astype(np.float32)
+def unit_rows(
+    descriptors: Shaped[np.ndarray, "n d"], out: Float32[np.ndarray, "n d"] | None = None
+) -> Descriptors:
+    """Make descriptors comparable by their dot product: rows of length 1 (a row of zeros stays one).
+
+    Args:
+        descriptors: As an extractor stores them.
+        out: Where the rows go; new memory if not given.
+    """
+    rows = np.empty(descriptors.shape, np.float32) if out is None else out
+    np.copyto(rows, descriptors, casting="unsafe")
     lengths = np.sqrt(np.einsum("nd,nd->n", rows, rows))
     rows /= np.maximum(lengths, np.float32(1e-12))[:, None]
     return rows

@@ -59,10 +59,11 @@ def _nearest_two(
     best, second = np.empty((2, len(descriptors1)), np.float32)
     best_of_column = np.full(len(descriptors2), -np.inf, np.float32)
     transposed = np.ascontiguousarray(descriptors2.T)
+    memory = np.empty((_BLOCK, len(descriptors2)), np.float32)  # one for all: fresh pages are dear
     for start in range(0, len(descriptors1), _BLOCK):
         block = slice(start, start + _BLOCK)
-        cosines = descriptors1[block] @ transposed
-        rows = np.arange(len(cosines))
+        rows = np.arange(len(descriptors1[block]))
+        cosines = np.matmul(descriptors1[block], transposed, out=memory[: len(rows)])
         nearest[block] = cosines.argmax(axis=1)
         best[block] = cosines[rows, nearest[block]]
         np.maximum(best_of_column, cosines.max(axis=0), out=best_of_column)

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from importlib import import_module
+from threading import local
 from time import perf_counter
 
 import numpy as np
 import pycolmap
+from jaxtyping import Shaped
 
-from slimsfm.arrays import Image
+from slimsfm.arrays import Descriptors, Image
 from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.localization.cameras import scaled_camera
 from slimsfm.localization.strategy import Strategy
@@ -85,6 +87,7 @@ class Localizer:
         self._map = map
         self._options = options
         self._extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+        self._memory = local()
         module, attribute = STRATEGIES[options.strategy_for(map)].split(":")
         self._strategy: Strategy = getattr(import_module(module), attribute)(map)
 
@@ -115,7 +118,7 @@ class Localizer:
 
     def _localize(self, features: Features, camera: pycolmap.Camera, extract_seconds: float) -> Localization:
         start = perf_counter()
-        matches = self._strategy.match(unit_rows(features.descriptors))
+        matches = self._strategy.match(self._unit_rows(features.descriptors))
         matched = perf_counter()
         pose = estimate_pose(
             features.keypoints[matches.keypoints].astype(np.float64),
@@ -125,6 +128,14 @@ class Localizer:
         )
         seconds = Seconds(extract=extract_seconds, match=matched - start, pose=perf_counter() - matched)
         return Localization(pose=pose, num_matches=len(matches), seconds=seconds)
+
+    def _unit_rows(self, descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
+        """Rows of unit length, in memory that each thread uses again: fresh pages are dear."""
+        memory = getattr(self._memory, "rows", None)
+        count, dimensions = descriptors.shape
+        if memory is None or len(memory) < count or memory.shape[1] != dimensions:
+            memory = self._memory.rows = np.empty((count, dimensions), np.float32)
+        return unit_rows(descriptors, out=memory[:count])
 
     def _map_camera(self, image: Image) -> pycolmap.Camera:
         height, width = image.shape[:2]

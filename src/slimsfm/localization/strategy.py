@@ -28,7 +28,10 @@ class Strategy(Protocol):
     """Matches queries against one map. Made once for a map, then called for every query."""
 
     def match(self, descriptors: Descriptors) -> PointMatches:
-        """Match the query's descriptors, rows of unit length, against the map."""
+        """Match the query's descriptors, rows of unit length, against the map.
+
+        Their memory is used again for the next query.
+        """
         ...
 
 

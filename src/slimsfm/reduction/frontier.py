@@ -28,8 +28,8 @@ USES = ("direct", "images")
 class FrontierOptions:
     """Which ways to reduce a map are compared."""
 
-    uses: tuple[str, ...] = USES
-    """What the reduced map is for."""
+    uses: tuple[str, ...] = ("direct",)
+    """What the reduced map is for: direct, images or both."""
 
     selectors: tuple[str, ...] = ("information", "kcover")
     """Who chooses points."""
