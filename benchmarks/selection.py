@@ -187,10 +187,9 @@ def sum_up(results: list[Result]) -> None:
             f"lost {lost[0]:5.1f} {lost[1]:5.1f} {lost[2]:5.1f} (targets 0.5 0.5 1)"
         )
     foretold = [one for one in results if one.foretold is not None]
-    for kind in sorted({one.strategy for one in foretold}):
-        differences = [abs(one.foretold - one.add[0]) for one in foretold if one.strategy == kind]
-        off = np.mean(differences)
-        print(f"foretold against true share within 0.1 d, {kind}: {off:.1f} points off (target 3)")
+    for method in dict.fromkeys(one.method for one in foretold):
+        off = np.mean([abs(one.foretold - one.add[0]) for one in foretold if one.method == method])
+        print(f"foretold against true share within 0.1 d, {method}: {off:.1f} points off (target 3)")
     if any(one.method == "kcover" for one in results):
         share_of_points(results, names)
 
