@@ -12,11 +12,11 @@ from slimsfm.features import unit_rows
 from slimsfm.mapping.io import bytes_by_part, write_map
 from slimsfm.mapping.map import check_map
 from slimsfm.mapping.subset import keep_images
-from slimsfm.reduction import FrontierOptions, Maker, frontier, points_seen, try_images
+from slimsfm.reduction import USES, FrontierOptions, Maker, frontier, points_seen, try_images
 from slimsfm.selection import SELECTORS
 
 BUDGETS = (15, 40)
-FEW = FrontierOptions(budgets=BUDGETS, dominators=(1, 2), rim=(False,))
+FEW = FrontierOptions(uses=USES, budgets=BUDGETS, dominators=(1, 2), rim=(False,))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import ReconstructionError
@@ -119,7 +120,8 @@ def reconstruct(database: Path, names: list[str], workspace: Path, *, seed: int)
     return model
 
 
-# One thread: with more, pycolmap's mappers do not give equal models for equal input, and are hardly faster.
+# One thread, of the libraries below as well: with more, pycolmap's mappers do not give equal models for equal
+# input, and are hardly faster.
 
 
 def _map_incrementally(database: Path, workspace: Path, seed: int) -> list[pycolmap.Reconstruction]:
@@ -129,7 +131,8 @@ def _map_incrementally(database: Path, workspace: Path, seed: int) -> list[pycol
     options.extract_colors = False
     options.min_model_size = 3
     pycolmap.set_random_seed(seed)
-    return list(pycolmap.incremental_mapping(database, workspace, workspace, options=options).values())
+    with threadpool_limits(1):
+        return list(pycolmap.incremental_mapping(database, workspace, workspace, options=options).values())
 
 
 def _map_globally(database: Path, workspace: Path, seed: int) -> list[pycolmap.Reconstruction]:
@@ -137,7 +140,8 @@ def _map_globally(database: Path, workspace: Path, seed: int) -> list[pycolmap.R
     options.num_threads = 1
     options.random_seed = seed
     pycolmap.set_random_seed(seed)
-    return list(pycolmap.global_mapping(database, workspace, workspace, options=options).values())
+    with threadpool_limits(1):
+        return list(pycolmap.global_mapping(database, workspace, workspace, options=options).values())
 
 
 def _name_images(model: pycolmap.Reconstruction, names: list[str]) -> None:
