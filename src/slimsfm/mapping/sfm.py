@@ -1,6 +1,5 @@
 """Structure from Motion by pycolmap, from our features to a model and its verified matches."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -73,7 +72,7 @@ def match_pairs(
 
 def _matching_options() -> pycolmap.FeatureMatchingOptions:
     options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = len(os.sched_getaffinity(0))
+    options.num_threads = 1  # with more, equal images have now and then not given equal matches
     options.use_gpu = False
     return options
 
