@@ -11,14 +11,13 @@ from functools import lru_cache
 from time import perf_counter
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float64
 from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
-from slimsfm.arrays import Descriptors, Ids, Mask, Points2D, Points3D
-from slimsfm.features import match_nearest, unit_rows
+from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors
-from slimsfm.localization.strategy import PointMatches, unite
+from slimsfm.localization.exhaustive import Target, match_targets, reference_target
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.point_file import quantize
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -68,24 +67,11 @@ class Prediction:
         return float(np.median(self.errors)) if len(self.errors) else np.inf
 
 
-Target = tuple[Float32[np.ndarray, "_ d"], Int64[np.ndarray, " _"]]
-"""Descriptors to match a query with, and the point of each; one target has more than another."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Trial:
     error: float
     inliers: int
     seconds: float
-
-
-def _match(query: Descriptors, targets: list[Target]) -> PointMatches:
-    found = []
-    for descriptors, points in targets:
-        pairs = match_nearest(query, descriptors)
-        pairs[:, 1] = points[pairs[:, 1]]
-        found.append(pairs)
-    return unite(found)
 
 
 class Trials:
@@ -134,7 +120,7 @@ class Trials:
     def _try(self, name: str, targets: list[Target]) -> _Trial:
         query, camera = self._left_out.query(name), self._map.camera(name)
         start = perf_counter()
-        matches = _match(query.descriptors, targets)
+        matches = match_targets(query.descriptors, targets)
         seconds = perf_counter() - start
         points2D = query.keypoints[matches.keypoints]
         points3D = self._map.points3D_in_world[matches.points]
@@ -175,5 +161,4 @@ class Trials:
 
     @lru_cache(maxsize=4 * _MOST_REFERENCES)  # noqa: B019, trials are few and short-lived
     def _reference(self, name: str) -> Target:
-        seen = self._map.observations[name]
-        return unit_rows(self._map.features[name].descriptors[seen.rows]), seen.points
+        return reference_target(self._map, name)
