@@ -5,13 +5,22 @@ Knows only functions: serial, on processes of this machine, or on a Dask cluster
 
 import logging
 import signal
-from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from multiprocessing import get_context
 from os import sched_getaffinity
 from typing import TypeVar
+
+from threadpoolctl import threadpool_limits
 
 from slimsfm.errors import WorkError
 
@@ -65,6 +74,28 @@ def dask_cluster(address: str | None, workers: int) -> Iterator[Executor]:
         except (OSError, ValueError) as error:
             raise WorkError(f"{address}: no Dask scheduler answers there ({error})") from error
         yield client.get_executor(pure=False)
+
+
+def on_threads(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int
+) -> Generator[Result, None, None]:
+    """Apply a function to tasks on threads of this process; results come in the order of the tasks.
+
+    For functions that spend their time outside of Python. While they run, the matrix library keeps to one
+    thread of its own, so that results are equal for any number of workers. At most twice as many tasks as
+    workers are under way, so results need not fit into memory.
+    """
+    waiting: deque[Future[Result]] = deque()
+    with threadpool_limits(1), ThreadPoolExecutor(workers) as executor:
+        try:
+            for task in tasks:
+                waiting.append(executor.submit(function, task))
+                if len(waiting) == 2 * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            executor.shutdown(wait=False, cancel_futures=True)
 
 
 def run_tasks(

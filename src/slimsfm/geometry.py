@@ -95,6 +95,17 @@ def reprojection_errors(
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
+def motions(points3D_in_cam: Points3D) -> Float64[np.ndarray, "n 3 6"]:
+    """How points move in the camera's frame when it is turned (radians, first three columns) and shifted."""
+    x, y, z = points3D_in_cam.T
+    moved = np.zeros((len(points3D_in_cam), 3, 6))
+    moved[:, 0, 1], moved[:, 0, 2] = z, -y
+    moved[:, 1, 0], moved[:, 1, 2] = -z, x
+    moved[:, 2, 0], moved[:, 2, 1] = y, -x
+    moved[:, [0, 1, 2], [3, 4, 5]] = 1
+    return moved
+
+
 def corner_error(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d, box: Box) -> float:
     """Mean distance of the box's corners under two poses, over the box's diagonal."""
     corners = box.corners

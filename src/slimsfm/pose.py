@@ -5,11 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import poselib
 import pycolmap
+from jaxtyping import Float64
 
 from slimsfm.arrays import Mask, Points2D, Points3D
+from slimsfm.geometry import Box, motions
 
 _MINIMAL = 3  # matches that P3P needs
 _MIN_ITERATIONS = 30  # hypotheses; a low share of inliers asks for more by itself
+_LEAST_SIGMA_PX = 0.5  # no detector places its keypoints more exactly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +52,33 @@ class PoseEstimate:
     inliers: Mask
     """Which of the given matches agree with the pose."""
 
+    covariance: Float64[np.ndarray, "6 6"] | None = None
+    """Of the small motion in the camera's frame, a turn in radians and then a shift in map units, that leads
+    from this pose to the true one, should the inliers be right; None where it was not computed."""
+
+    confidence: float | None = None
+    """Probability that the pose is right, its corner error below a tenth of the diagonal; None where nobody
+    verified it."""
+
     @property
     def num_inliers(self) -> int:
         """How many matches agree with the pose."""
         return int(self.inliers.sum())
+
+    def predicted_corner_error(self, box: Box) -> float:
+        """The relative corner error to expect, should the inliers be right.
+
+        The covariance is carried to the corners of the box; a corner counts with the root of its mean square
+        distance, and the mean of all eight is taken over the diagonal.
+
+        Raises:
+            ValueError: The pose has no covariance.
+        """
+        if self.covariance is None:
+            raise ValueError("covariance must be there to predict an error; estimate_pose computes it")
+        moved = motions(self.cam_from_world * box.corners)
+        squares = np.einsum("nia,ab,nib->n", moved, self.covariance, moved)
+        return float(np.sqrt(np.maximum(squares, 0)).mean() / box.diagonal)
 
 
 def estimate_pose(
@@ -102,8 +128,36 @@ def estimate_pose(
     if inliers.sum() < options.min_inliers:
         return None
     w, x, y, z = pose.q
-    rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
-    return PoseEstimate(cam_from_world=pycolmap.Rigid3d(rotation, pose.t), inliers=inliers)
+    cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), pose.t)
+    covariance = pose_covariance(
+        pinhole_points2D[inliers], points3D_in_world[inliers], cam_from_world, camera.mean_focal_length()
+    )
+    return PoseEstimate(cam_from_world=cam_from_world, inliers=inliers, covariance=covariance)
+
+
+def pose_covariance(
+    pinhole_points2D: Points2D, points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, focal: float
+) -> Float64[np.ndarray, "6 6"]:
+    """How exactly matches fix a pose: the inverse of their information, times their own scatter.
+
+    The scatter is that of the reprojection errors, yet no less than half a pixel. Where the matches leave a
+    motion of the camera free, such as all of them on one line, its variance is huge.
+
+    Args:
+        pinhole_points2D: Pixels of an ideal pinhole camera, principal point (0, 0).
+        points3D_in_world: What was matched with them.
+        cam_from_world: The pose.
+        focal: Focal length in pixels.
+    """
+    in_cam = cam_from_world * points3D_in_world
+    x, y, z = in_cam.T
+    zero = np.zeros_like(z)
+    in_pixels = focal * np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(2, 0, 1)
+    jacobian = (in_pixels @ motions(in_cam)).reshape(-1, 6)
+    squares = np.sum((focal * in_cam[:, :2] / z[:, None] - pinhole_points2D) ** 2)
+    variance = max(squares / max(2 * len(in_cam) - 6, 1), _LEAST_SIGMA_PX**2)
+    values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+    return variance * (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T
 
 
 def _check_matches(points2D: Points2D, points3D_in_world: Points3D) -> None:

@@ -55,9 +55,8 @@ def test_a_benchmark_of_an_exact_scene(narrow, graph, queries, stored, store):
     result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh)
     labels = [(row.strategy, row.variant) for row in result.rows]
     images = ["full", "dominating", "random"]
-    assert labels == [("exhaustive", v) for v in images] + [
-        ("direct", v) for v in [*images[:2], "default", images[2]]
-    ]
+    by_images = [(s, v) for s in ("exhaustive", "retrieval", "progressive") for v in images]
+    assert labels == by_images + [("direct", v) for v in [*images[:2], "default", images[2]]]
     count = len(result.solution.chosen)
     assert dominates(graph.adjacency(), result.solution.chosen)
     for row in result.rows:
@@ -131,7 +130,7 @@ def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
     [
         (
             {"strategies": ("direct", "guess")},
-            "strategies must be among direct, exhaustive, got direct, guess",
+            "strategies must be among direct, exhaustive, progressive, retrieval, got direct, guess",
         ),
         ({"strategies": ()}, "strategies must be among .* got none"),
         ({"variants": ("half",)}, "variants must be among full, dominating, default, random, got half"),

@@ -9,6 +9,7 @@ from slimsfm.evaluation.metrics import (
     NO_POSE,
     PoseError,
     add_percent,
+    confidence_wrong,
     deg_cm_percent,
     pose_error,
     score,
@@ -29,11 +30,13 @@ def error(corner=0.0, deg=0.0, translation=0.0):
     return PoseError(relative_corner_error=corner, rotation_deg=deg, translation=translation)
 
 
-def localization(pose=None, extract=0.01, match=0.02, pose_seconds=0.005):
+def localization(pose=None, extract=0.01, match=0.02, pose_seconds=0.005, confidence=None):
     inliers = np.ones(20, dtype=bool)
     return Localization(
-        pose=pose and PoseEstimate(cam_from_world=pose, inliers=inliers),
-        num_matches=20,
+        pose=pose and PoseEstimate(cam_from_world=pose, inliers=inliers, confidence=confidence),
+        points2D=np.zeros((20, 2)),
+        points3D_in_world=np.zeros((20, 3)),
+        references=3,
         seconds=Seconds(extract=extract, match=match, pose=pose_seconds),
     )
 
@@ -155,3 +158,13 @@ def test_results_cannot_be_changed():
     with pytest.raises(AttributeError):
         NO_POSE.rotation_deg = 0.0
     assert replace(NO_POSE, rotation_deg=0.0).rotation_deg == 0.0
+
+
+def test_only_sure_poses_count_as_wrong_when_sure():
+    pose = rigid((0, 0, 1), 10.0, (0, 0, 2))
+    found = [localization(pose, confidence=one) for one in (0.95, 0.99, 0.9, 0.2)] + [localization()]
+    errors = [error(0.01), error(0.1), error(0.5), error(0.5), NO_POSE]
+    assert confidence_wrong(errors, found) == 0.5
+    assert confidence_wrong(errors[2:], found[2:]) is None
+    assert score(errors, found, metric=False).confidence_wrong == 0.5
+    assert score(errors, found, metric=False).references_tried == 3

@@ -11,6 +11,7 @@ from slimsfm.localization import Localization, Seconds
 KEYS = {
     *("object", "strategy", "variant", "references", "points", "map_bytes", "queries", "localized"),
     *("add_0.1d", "add_0.05d", "add_0.02d", "median_corner_error"),
+    *("confidence_wrong_at_0.9", "references_tried"),
     *("ms_extract", "ms_match", "ms_pose", "ms_total", "fps"),
 }
 METRIC_KEYS = {"1deg_1cm", "3deg_3cm", "5deg_5cm"}
@@ -24,7 +25,14 @@ def row(corner_errors, *, metric=False, match=0.02, references=4.0, variant="ran
         for one in corner_errors
     ]
     seconds = Seconds(extract=0.01, match=match, pose=0.01)
-    found = [Localization(pose=None, num_matches=0, seconds=seconds)] * len(errors)
+    nothing = Localization(
+        pose=None,
+        points2D=np.zeros((0, 2)),
+        points3D_in_world=np.zeros((0, 3)),
+        references=4,
+        seconds=seconds,
+    )
+    found = [nothing] * len(errors)
     return Row(
         object="toy",
         strategy="direct",

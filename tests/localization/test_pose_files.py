@@ -22,7 +22,9 @@ def results():
     return {
         name: Localization(
             pose=PoseEstimate(cam_from_world=TRUTH[name], inliers=inliers) if name in FOUND else None,
-            num_matches=20,
+            points2D=np.zeros((20, 2)),
+            points3D_in_world=np.zeros((20, 3)),
+            references=3,
             seconds=seconds,
         )
         for name in TRUTH

@@ -1,5 +1,8 @@
 import copy
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib import import_module
+from itertools import pairwise
 
 import numpy as np
 import pycolmap
@@ -13,7 +16,7 @@ from slimsfm.features import Features, unit_rows
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
 from slimsfm.localization.direct import describe_points
-from slimsfm.localization.strategy import Strategy, unite
+from slimsfm.localization.strategy import MatchingOptions, Query, Strategy, unite
 from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.map import Map
 
@@ -57,7 +60,8 @@ def test_a_reference_as_query_gets_its_own_pose_back(exact, options):
     for name, image in exact.images.items():
         found = localizer.localize_features(exact.features[name], camera()).pose
         assert corner_error(found.cam_from_world, image.cam_from_world(), BOX) < TENTH_OF_A_PER_MILLE
-        assert found.num_inliers == len(exact.observations[name].rows)
+        assert found.num_inliers == len(found.inliers)
+        assert found.confidence > 0.9
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"])
@@ -69,7 +73,7 @@ def test_a_new_view_through_any_lens_is_localized(exact, options, model):
     query = features(keypoints, descriptors_of_points(exact))
     found = Localizer(exact, options).localize_features(query, lens)
     assert corner_error(found.pose.cam_from_world, cam_from_world, BOX) < TENTH_OF_A_PER_MILLE
-    assert found.num_matches == len(exact.point3D_ids)
+    assert found.pose.num_inliers == found.num_matches
 
 
 def test_an_unrelated_query_has_no_pose(exact, options):
@@ -105,17 +109,62 @@ def test_equal_queries_get_equal_poses(exact, options):
     assert np.array_equal(matrices[0], matrices[2])
 
 
-def test_matches_are_sorted_name_what_exists_and_occur_once(exact, options):
-    localizer = Localizer(exact, options)
-    strategy = localizer._strategy
+def test_each_round_gives_all_matches_so_far_sorted_and_once(exact, options):
+    strategy = strategy_of(exact, options)
     assert isinstance(strategy, Strategy)
-    query = unit_rows(exact.features["003.png"].descriptors)
-    matches = strategy.match(query)
-    pairs = list(zip(matches.keypoints.tolist(), matches.points.tolist(), strict=True))
-    assert pairs == sorted(set(pairs))
-    assert len(matches) == len(pairs) == len(exact.point3D_ids)
-    assert max(matches.keypoints) < len(query)
-    assert max(matches.points) < len(exact.point3D_ids)
+    of_image = exact.features["003.png"]
+    query = Query(keypoints=of_image.keypoints.astype(float), descriptors=unit_rows(of_image.descriptors))
+    rounds = [
+        list(zip(matches.keypoints.tolist(), matches.points.tolist(), strict=True))
+        for matches in strategy.rounds(query)
+    ]
+    for before, pairs in pairwise([[], *rounds]):
+        assert pairs == sorted(set(pairs))
+        assert set(pairs) >= set(before)
+    seen = exact.observations["003.png"]
+    assert rounds[-1] == list(zip(seen.rows.tolist(), seen.points.tolist(), strict=True))
+
+
+def test_what_a_camera_should_see_it_does_see(exact, options):
+    strategy = strategy_of(exact, options)
+    for name, image in exact.images.items():
+        for agreeing in (None, exact.observations[name].points[:20]):
+            expected, points = strategy.expected(image.cam_from_world(), agreeing)
+            assert len(expected) == len(points) > 0
+            assert np.allclose(expected, descriptors_of_points(exact)[points], atol=1e-5)
+            assert np.isin(points, exact.observations[name].points).all()
+
+
+@pytest.mark.parametrize("kept", [1, 2, 5])
+def test_retrieval_matches_with_as_many_images_as_asked(exact, kept):
+    options = LocalizationOptions(strategy="retrieval", matching=MatchingOptions(retrieved=kept))
+    localizer = Localizer(exact, options)
+    assert localizer.localize_features(exact.features["004.png"], camera()).references == kept
+
+
+def test_the_order_of_the_keypoints_does_not_matter(exact, options):
+    localizer, of_image = Localizer(exact, options), exact.features["002.png"]
+    of_image = replace(of_image, scores=np.linspace(1, 2, len(of_image), dtype=np.float32))
+    order = np.random.default_rng(0).permutation(len(of_image))
+    one, other = (localizer.localize_features(f, camera()) for f in (of_image, of_image[order]))
+    assert np.array_equal(one.points2D, other.points2D)
+    assert np.array_equal(one.pose.cam_from_world.matrix(), other.pose.cam_from_world.matrix())
+
+
+def test_a_localizer_serves_several_threads(exact, options):
+    localizer = Localizer(exact, options)
+    queries = 4 * list(exact.features.values())
+    alone = [localizer.localize_features(query, camera()) for query in queries]
+    with ThreadPoolExecutor(4) as executor:
+        together = list(executor.map(lambda query: localizer.localize_features(query, camera()), queries))
+    for a, b in zip(alone, together, strict=True):
+        assert np.array_equal(a.pose.cam_from_world.matrix(), b.pose.cam_from_world.matrix())
+        assert a.pose.confidence == b.pose.confidence
+
+
+def strategy_of(map_: Map, options: LocalizationOptions) -> Strategy:
+    module, attribute = STRATEGIES[options.strategy].split(":")
+    return getattr(import_module(module), attribute)(map_, MatchingOptions(retrieved=len(map_.images)))
 
 
 @given(st.lists(arrays(np.int64, st.tuples(st.integers(0, 5), st.just(2)), elements=st.integers(0, 3))))
@@ -126,14 +175,17 @@ def test_uniting_is_the_union_of_sets(parts):
 
 
 def test_an_unknown_strategy_is_named():
-    with pytest.raises(ValueError, match="strategy must be auto or one of direct, exhaustive, got 'guess'"):
+    with pytest.raises(
+        ValueError,
+        match="strategy must be auto or one of direct, exhaustive, progressive, retrieval, got 'guess'",
+    ):
         LocalizationOptions(strategy="guess")
 
 
 def test_by_itself_it_matches_points_where_the_map_has_some_chosen_for_it(exact):
     options = LocalizationOptions()
     assert options.strategy == "auto"
-    assert options.strategy_for(exact) == "exhaustive"
+    assert options.strategy_for(exact) == "progressive"
     chosen = describe_points(exact)
     for map_ in (direct_map(exact, chosen), with_points(exact, exact, chosen)):
         assert options.strategy_for(map_) == "direct"

@@ -8,7 +8,8 @@ from slimsfm.features import unit_rows
 from slimsfm.localization.direct import describe_points
 from slimsfm.mapping.subset import keep_images
 from slimsfm.selection.left_out import LeftOut
-from slimsfm.selection.views import observed, selection_problem
+from slimsfm.mapping.map import observed
+from slimsfm.selection.views import selection_problem
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,12 @@
 """`slimsfm localize`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
+import pycolmap
 
 from slimsfm.cli.output import (
     Flat,
@@ -17,12 +19,18 @@ from slimsfm.cli.output import (
     finish,
     parse,
 )
-from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.errors import InputError
+from slimsfm.execution import num_cores, on_threads
+from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
 from slimsfm.localization.cameras import query_camera, read_camera
-from slimsfm.localization.pose_files import write_poses, writer_for
+from slimsfm.localization.pose_files import write_object_poses, write_poses, writer_for
 from slimsfm.mapping.io import read_map
+from slimsfm.mapping.map import Map
 from slimsfm.photos import list_images, read_image
 from slimsfm.progress import shown
+
+Found = dict[str, Localization]
+"""What became of each object in one image."""
 
 
 def localize(
@@ -30,8 +38,10 @@ def localize(
     images: ImagesPath,
     /,
     output: OutputPath,
+    also: tuple[Path, ...] = (),
     localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
     camera: Path | None = None,
+    workers: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Find where images were taken.
@@ -40,36 +50,85 @@ def localize(
         map: A map.
         images: A folder of images, or one image.
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
+        also: Maps of further objects to seek in the same images; then poses go to .json or .csv.
         localization: How to localize.
         camera: Intrinsics of the images, in COLMAP's cameras.txt format; else the map's or EXIF's.
+        workers: Images to work on at a time; one a core if not given.
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
-    check_output(output, map, overwrite=overwrite)
-    check_output(output, images, overwrite=overwrite)
-    writer_for(output)
-    given = read_camera(camera) if camera else None
-    map_ = read_map(map)
-    folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
-    cameras = {name: query_camera(map_, folder / name, given) for name in names}
-    localizer = Localizer(map_, localization)
-    results = {
-        name: localizer.localize(read_image(folder / name), cameras[name])
-        for name in shown(names, f"localize ({localization.strategy_for(map_)})")
-    }
-    write_poses(output, results, overwrite=overwrite)
-    for name, one in results.items():
-        outcome = (
-            f"{one.pose.num_inliers} inliers of {one.num_matches} matches" if one.pose else "not localized"
-        )
-        console.print(f"{name}: {outcome}", style=None if one.pose else "yellow")
-    stages = ("extract", "match", "pose")
-    times = [1e3 * np.mean([getattr(one.seconds, stage) for one in results.values()]) for stage in stages]
-    console.print(
-        "a query: " + ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in zip(stages, times, strict=True))
-    )
-    found = sum(one.pose is not None for one in results.values())
+    for source in (map, images, *also):
+        check_output(output, source, overwrite=overwrite)
+    writer_for(output, several=bool(also))
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1, got {workers}")
+    maps = {name: read_map(path) for name, path in _named(map, *also).items()}
+    queries = _queries(maps, images, read_camera(camera) if camera else None)
+    localizers = {name: Localizer(one, localization) for name, one in maps.items()}
+    run = on_threads(partial(_localize, MultiLocalizer(localizers)), queries, workers or num_cores())
+    label = f"localize ({', '.join(sorted({localization.strategy_for(one) for one in maps.values()}))})"
+    results = {query.name: next(run) for query in shown(queries, label)}
+    by_object = {name: {image: one[name] for image, one in results.items()} for name in maps}
+    if also:
+        write_object_poses(output, by_object, overwrite=overwrite)
+    else:
+        write_poses(output, next(iter(by_object.values())), overwrite=overwrite)
+    _print(results, several=bool(also))
+    found = sum(any(one.pose for one in of_image.values()) for of_image in results.values())
     finish(f"{output}: {found} of {len(results)} images localized", watch, "info", map)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Query:
+    name: str
+    path: Path
+    cameras: Mapping[str, pycolmap.Camera]
+
+
+def _named(*paths: Path) -> dict[str, Path]:
+    """Maps by the last part of their paths, or by the whole where these are equal."""
+    last = [path.resolve().name for path in paths]
+    names = last if len(set(last)) == len(last) else [str(path) for path in paths]
+    if len(set(names)) < len(names):
+        raise InputError(f"also: the map {max(names, key=names.count)} is given twice")
+    return dict(zip(names, paths, strict=True))
+
+
+def _queries(maps: Mapping[str, Map], images: Path, given: pycolmap.Camera | None) -> list[_Query]:
+    folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
+    return [
+        _Query(
+            name=name,
+            path=folder / name,
+            cameras={key: query_camera(one, folder / name, given) for key, one in maps.items()},
+        )
+        for name in names
+    ]
+
+
+def _localize(localizer: MultiLocalizer, query: _Query) -> Found:
+    return localizer.localize(read_image(query.path), query.cameras)
+
+
+def _print(results: Mapping[str, Found], *, several: bool) -> None:
+    for image, found in results.items():
+        for key, one in found.items():
+            name = f"{image}, {key}" if several else image
+            console.print(f"{name}: {_outcome(one)}", style=None if one.pose else "yellow")
+    stages = ("extract", "match", "pose")
+    times = dict.fromkeys(stages, 0.0)
+    for one in (one for found in results.values() for one in found.values()):
+        for stage in stages:
+            times[stage] += 1e3 * getattr(one.seconds, stage) / len(results)
+    console.print("a query: " + ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in times.items()))
+
+
+def _outcome(one: Localization) -> str:
+    if one.pose is None:
+        return "not localized"
+    return (
+        f"{one.pose.num_inliers} inliers of {one.num_matches} matches, confidence {one.pose.confidence:.2f}"
+    )
 
 
 def main(arguments: Sequence[str]) -> None:

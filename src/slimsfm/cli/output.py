@@ -131,7 +131,8 @@ def print_rows(rows: Sequence[Row]) -> None:
     console.print(table)
     console.print(
         "0.1d, 0.05d, 0.02d: % of queries with box corners off by less than this share of the diagonal d; "
-        "median: of that error; found: % with any pose",
+        "median: of that error; found: % with any pose; "
+        "wrong: % beyond 0.1d of the poses with confidence over 0.9; tried: references matched with a query",
         style="dim",
     )
     if not metric:
@@ -143,7 +144,7 @@ def _header(*, metric: bool, several: bool) -> list[str]:
         *(["object"] if several else []),
         *("strategy", "variant", "images", "points", "size"),
         *([f"{n}°-{n}cm" for n in DEG_CM] if metric else []),
-        *("0.1d", "0.05d", "0.02d", "median", "found", "extract", "match", "pose", "FPS"),
+        *("0.1d", "0.05d", "0.02d", "median", "found", "wrong", "tried", "extract", "match", "pose", "FPS"),
     ]
 
 
@@ -155,7 +156,9 @@ def _cells(row: Row, *, metric: bool, several: bool) -> list[str]:
         *([f"{share:.1f}" for share in (scores.deg_cm or {}).values()] if metric else []),
         *(f"{share:.1f}" for share in scores.add.values()),
         *(f"{scores.median_corner_error:.4f}d", f"{scores.localized:.1f}"),
-        *(f"{1e3 * part:.0f} ms" for part in (seconds.extract, seconds.match, seconds.pose)),
+        "-" if scores.confidence_wrong is None else f"{100 * scores.confidence_wrong:.1f}",
+        f"{scores.references_tried:.1f}",
+        *(f"{1e3 * part:.1f} ms" for part in (seconds.extract, seconds.match, seconds.pose)),
         f"{scores.fps:.1f}",
     ]
 

@@ -24,7 +24,7 @@ Store = Callable[[Map, str], StoredMap]
 class BenchmarkOptions:
     """What is compared."""
 
-    strategies: tuple[str, ...] = ("exhaustive", "direct")
+    strategies: tuple[str, ...] = ("exhaustive", "retrieval", "progressive", "direct")
     """How queries are matched."""
 
     variants: tuple[str, ...] = tuple(VARIANTS)

@@ -8,9 +8,13 @@ import pycolmap
 
 from slimsfm.geometry import ADD_FRACTIONS, Box, corner_error, rotation_error_deg, translation_error
 from slimsfm.localization import Localization, Seconds
+from slimsfm.localization.verification import RIGHT
 
 DEG_CM = (1, 3, 5)
 """n of n degrees - n cm."""
+
+SURE = 0.9
+"""Confidence over which a pose is taken for right."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +64,20 @@ def deg_cm_percent(errors: Sequence[PoseError], n: int) -> float:
     )
 
 
+def confidence_wrong(errors: Sequence[PoseError], localizations: Sequence[Localization]) -> float | None:
+    """Share of wrong poses among those whose confidence is over `SURE`; None where there is no such pose.
+
+    Confidence is the probability that the corner error is below a tenth of the diagonal, so a tenth of the
+    poses, at most, should be wrong.
+    """
+    sure = [
+        error.relative_corner_error
+        for error, one in zip(errors, localizations, strict=True)
+        if one.pose and (one.pose.confidence or 0) > SURE
+    ]
+    return float(np.mean(np.array(sure) >= RIGHT)) if sure else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scores:
     """What localizing many queries gave. Percentages are of all queries."""
@@ -78,6 +96,13 @@ class Scores:
 
     deg_cm: dict[int, float] | None
     """Percentage within n degrees and n cm for each of `DEG_CM`; None where the unit is unknown."""
+
+    confidence_wrong: float | None
+    """Share of wrong poses, off by a tenth of the diagonal or more, among those that are `SURE`; None where
+    no pose is."""
+
+    references_tried: float
+    """Reference images that a query was matched with, on average."""
 
     seconds: Seconds
     """Mean time a query."""
@@ -104,5 +129,7 @@ def score(errors: Sequence[PoseError], localizations: Sequence[Localization], *,
         add={fraction: add_percent(errors, fraction) for fraction in ADD_FRACTIONS},
         median_corner_error=float(np.median([error.relative_corner_error for error in errors])),
         deg_cm={n: deg_cm_percent(errors, n) for n in DEG_CM} if metric else None,
+        confidence_wrong=confidence_wrong(errors, localizations),
+        references_tried=float(np.mean([one.references for one in localizations])),
         seconds=Seconds(extract=extract, match=match, pose=pose),
     )

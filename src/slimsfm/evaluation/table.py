@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slimsfm.evaluation.metrics import ADD_FRACTIONS, DEG_CM, Scores
+from slimsfm.evaluation.metrics import ADD_FRACTIONS, DEG_CM, SURE, Scores
 from slimsfm.localization import Seconds
 
 
@@ -48,6 +48,8 @@ class Row:
             "localized": scores.localized,
             **{f"add_{fraction}d": scores.add[fraction] for fraction in ADD_FRACTIONS},
             "median_corner_error": _finite(scores.median_corner_error),
+            f"confidence_wrong_at_{SURE}": scores.confidence_wrong,
+            "references_tried": scores.references_tried,
             "ms_extract": 1e3 * seconds.extract,
             "ms_match": 1e3 * seconds.match,
             "ms_pose": 1e3 * seconds.pose,
@@ -81,6 +83,8 @@ def mean_row(rows: Sequence[Row]) -> Row:
             add={fraction: _mean([one.add[fraction] for one in scores]) for fraction in ADD_FRACTIONS},
             median_corner_error=float(np.median([one.median_corner_error for one in scores])),
             deg_cm={n: _mean([(one.deg_cm or {})[n] for one in scores]) for n in DEG_CM} if metric else None,
+            confidence_wrong=_mean_of_known([one.confidence_wrong for one in scores]),
+            references_tried=_mean([one.references_tried for one in scores]),
             seconds=Seconds(
                 extract=_mean([one.extract for one in seconds]),
                 match=_mean([one.match for one in seconds]),
@@ -92,3 +96,8 @@ def mean_row(rows: Sequence[Row]) -> Row:
 
 def _mean(values: Sequence[float | int]) -> float:
     return float(np.mean(values))
+
+
+def _mean_of_known(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return _mean(known) if known else None

@@ -2,10 +2,10 @@
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
-from scipy.sparse import csr_array, triu
+from scipy.sparse import triu
 
 from slimsfm.geometry import project
-from slimsfm.mapping.map import Map
+from slimsfm.mapping.map import Map, observed
 
 _GRID = 5  # samples of the box along each edge
 _MAX_ANGLE_DEG = 75.0  # between viewing directions; no extractor here bears more
@@ -14,12 +14,7 @@ _BLOCK = 1024  # images compared at a time
 
 def covisible_pairs(map: Map, min_points: int = 1) -> Int64[np.ndarray, "k 2"]:
     """Pairs (u, v), u < v, that see at least so many common points; O(sum of squared track lengths)."""
-    seen = list(map.observations.values())
-    counts = [len(np.unique(one.points)) for one in seen]
-    columns = np.concatenate([np.unique(one.points) for one in seen])
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    shape = (len(seen), len(map.point3D_ids))
-    incidence = csr_array((np.ones(len(columns), np.int32), columns, starts), shape=shape)
+    incidence = observed(map).astype(np.int32)
     common = triu(incidence @ incidence.T, k=1).tocoo()
     enough = common.data >= min_points
     return _sorted(np.stack([common.row[enough], common.col[enough]], axis=1).astype(np.int64))

@@ -1,35 +1,66 @@
 """Match the query against points of the map, each described by the mean of its observations [1].
 
+The strongest keypoints of a query are matched first: where they give a sure pose, the many weak ones are
+never looked at.
+
 References:
     [1] Sattler, Leibe and Kobbelt, Fast Image-based Localization using Direct 2D-to-3D Matching, ICCV 2011.
 """
 
 import numpy as np
-from jaxtyping import Float32
+import pycolmap
+from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import Descriptors
-from slimsfm.features import NearestOptions, match_nearest, unit_rows
-from slimsfm.localization.strategy import PointMatches
+from slimsfm.features import unit_rows
+from slimsfm.localization.references import match_target
+from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
 from slimsfm.mapping.map import Map, PointDescriptors
+
+_STRONGEST = (1024,)  # keypoints of the rounds before the last, which takes all
+_NARROWEST = 0.5  # cosine: a point may be seen from 60 degrees beside where it was seen from
 
 
 class Direct:
     """Matches against all described points at once. O(keypoints x points) a query."""
 
-    def __init__(self, map: Map, matching: NearestOptions = NearestOptions()) -> None:
-        self._matching = matching
+    def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
+        self._matching = options.nearest
         self._described = map.point_descriptors or describe_points(map)
+        self._positions = map.points3D_in_world[self._described.points].astype(np.float32)
+        self._target = self._described.descriptors, self._described.points
 
-    def match(self, descriptors: Descriptors) -> PointMatches:
-        """Match the query's descriptors against the points' mean descriptors."""
-        pairs = match_nearest(descriptors, self._described.descriptors, self._matching)
-        return PointMatches(keypoints=pairs[:, 0], points=self._described.points[pairs[:, 1]])
+    def rounds(self, query: Query) -> Rounds:
+        """Match the strongest keypoints, then all, with the points' mean descriptors."""
+        counts = [count for count in _STRONGEST if count < len(query.descriptors)]
+        for count in (*counts, len(query.descriptors)):
+            yield unite([match_target(query.descriptors[:count], self._target, self._matching)])
+
+    def expected(
+        self,
+        cam_from_world: pycolmap.Rigid3d,
+        agreeing: Int64[np.ndarray, " _"] | None = None,  # noqa: ARG002
+    ) -> Target:
+        """The points that were seen from about where the camera stands.
+
+        Of unit vectors spread over a cone the mean has the length (1 + cosine of its half angle) / 2, so the
+        length of a point's direction tells how far around it was seen.
+        """
+        if self._described.directions is None:
+            return self._target
+        towards = cam_from_world.inverse().translation.astype(np.float32) - self._positions
+        lengths = np.linalg.norm(self._described.directions, axis=1)
+        least = np.minimum(_NARROWEST, 2 * lengths - 1)
+        products = np.einsum("nd,nd->n", towards, self._described.directions)
+        facing = np.flatnonzero(products >= least * lengths * np.linalg.norm(towards, axis=1))
+        return self._described.descriptors[facing], self._described.points[facing]
 
 
 def describe_points(map: Map) -> PointDescriptors:
     """All points, each with the mean, made of unit length, of the descriptors of its observations."""
     points = np.arange(len(map.point3D_ids), dtype=np.int64)
-    return PointDescriptors(points=points, descriptors=unit_rows(descriptor_sums(map)))
+    return PointDescriptors(
+        points=points, descriptors=unit_rows(descriptor_sums(map)), directions=_directions(map)
+    )
 
 
 def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
@@ -41,3 +72,15 @@ def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
             sums = np.zeros((len(map.point3D_ids), descriptors.shape[1]), np.float32)
         np.add.at(sums, seen.points, descriptors)  # an image may see a point twice
     return np.zeros((0, 0), np.float32) if sums is None else sums
+
+
+def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:
+    """Where each point was seen from: the mean unit vector towards the cameras that observe it."""
+    sums = np.zeros((len(map.point3D_ids), 3))
+    counts = np.zeros(len(sums))
+    for name, seen in map.observations.items():
+        towards = map.images[name].projection_center() - map.points3D_in_world[seen.points]
+        lengths = np.linalg.norm(towards, axis=1, keepdims=True)
+        np.add.at(sums, seen.points, towards / np.maximum(lengths, np.finfo(np.float64).tiny))
+        np.add.at(counts, seen.points, 1)
+    return (sums / np.maximum(counts, 1)[:, None]).astype(np.float32)

@@ -1,5 +1,6 @@
 """From a query image to its pose."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from threading import local
@@ -9,17 +10,21 @@ import numpy as np
 import pycolmap
 from jaxtyping import Shaped
 
-from slimsfm.arrays import Descriptors, Image
+from slimsfm.arrays import Descriptors, Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.localization.cameras import scaled_camera
-from slimsfm.localization.strategy import Strategy
+from slimsfm.localization.guided import extract_near
+from slimsfm.localization.search import Attempt, Found, Search
+from slimsfm.localization.strategy import MatchingOptions, Query, Strategy
 from slimsfm.mapping.map import Map
-from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+from slimsfm.pose import PoseEstimate, RansacOptions
 
 # Paths, not classes: naming a strategy must not import what it needs.
 STRATEGIES = {
     "direct": "slimsfm.localization.direct:Direct",
     "exhaustive": "slimsfm.localization.exhaustive:Exhaustive",
+    "progressive": "slimsfm.localization.progressive:Progressive",
+    "retrieval": "slimsfm.localization.retrieval:Retrieval",
 }
 
 
@@ -28,23 +33,32 @@ class LocalizationOptions:
     """How queries are localized."""
 
     strategy: str = "auto"
-    """Match against each reference image (exhaustive) or against the points (direct); auto: direct where the
-    map has points chosen for it."""
+    """Match against each reference image (exhaustive), those that look like the query (retrieval), one after
+    the other until the pose is sure (progressive), or against the points (direct); auto: direct where the
+    map has points chosen for it, else progressive."""
+
+    matching: MatchingOptions = MatchingOptions()
+    """How strategies match."""
 
     ransac: RansacOptions = RansacOptions()
     """The pose search."""
+
+    min_confidence: float = 0.5
+    """A pose less sure than this is not given out: the query counts as not localized."""
 
     def __post_init__(self) -> None:
         if self.strategy not in ("auto", *STRATEGIES):
             raise ValueError(
                 f"strategy must be auto or one of {', '.join(sorted(STRATEGIES))}, got {self.strategy!r}"
             )
+        if not 0 <= self.min_confidence <= 1:
+            raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
 
     def strategy_for(self, map: Map) -> str:
         """The strategy to use with a map."""
         if self.strategy != "auto":
             return self.strategy
-        return "exhaustive" if map.point_descriptors is None else "direct"
+        return "progressive" if map.point_descriptors is None else "direct"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,23 +87,38 @@ class Localization:
     pose: PoseEstimate | None
     """Where the camera stood, or None: the query could not be localized."""
 
-    num_matches: int
-    """2D-3D matches that the pose was sought in."""
+    points2D: Points2D
+    """Pixels of the 2D-3D matches that the pose was sought in."""
+
+    points3D_in_world: Points3D
+    """For each of them the point of the map."""
+
+    references: int
+    """Reference images that the query was matched with."""
+
+    predicted_corner_error: float | None = None
+    """Relative corner error to expect of the pose, should its inliers be right; None where there is none."""
 
     seconds: Seconds
     """Time it took."""
+
+    @property
+    def num_matches(self) -> int:
+        """How many 2D-3D matches there were."""
+        return len(self.points2D)
 
 
 class Localizer:
     """Localizes query images against one map."""
 
     def __init__(self, map: Map, options: LocalizationOptions = LocalizationOptions()) -> None:
-        self._map = map
+        self.map = map
         self._options = options
         self._extractor = load_extractor(map.info.extractor, map.info.extractor_options)
         self._memory = local()
         module, attribute = STRATEGIES[options.strategy_for(map)].split(":")
-        self._strategy: Strategy = getattr(import_module(module), attribute)(map)
+        strategy: Strategy = getattr(import_module(module), attribute)(map, options.matching)
+        self._search = Search(map, strategy, options.ransac)
 
     def localize(self, image: Image, camera: pycolmap.Camera | None = None) -> Localization:
         """Localize one image.
@@ -102,32 +131,69 @@ class Localizer:
         Raises:
             ValueError: No camera is given and the map's cannot stand in, or it is of another size.
         """
-        camera = camera or self._map_camera(image)
-        if (camera.width, camera.height) != image.shape[1::-1]:
-            raise ValueError(
-                f"camera must be of the image's size {image.shape[1]}x{image.shape[0]}, "
-                f"got {camera.width}x{camera.height}"
-            )
+        camera = self.camera_of(image, camera)
         start = perf_counter()
         features = self._extractor.extract(image)
-        return self._localize(features, camera, perf_counter() - start)
+        return self._localized(features, camera, perf_counter() - start)
+
+    def localize_near(
+        self, image: Image, camera: pycolmap.Camera | None, near_cam_from_world: pycolmap.Rigid3d
+    ) -> Localization:
+        """Localize one image whose pose is about known, as that of the last frame of a video.
+
+        Features are sought just where the object's box should be, and matched just with points that project
+        near them: several times faster than `localize`, and more points are found.
+
+        Args:
+            image: Upright RGB.
+            camera: As of `localize`.
+            near_cam_from_world: A pose under which points project within a twelfth of the image's longer side
+                of where they are.
+
+        Returns:
+            No pose where the object is not about there; `localize` may find it elsewhere.
+
+        Raises:
+            ValueError: As of `localize`.
+        """
+        camera = self.camera_of(image, camera)
+        start = perf_counter()
+        features = extract_near(self._extractor, image, self.map.box, near_cam_from_world, camera)
+        seconds, query = perf_counter() - start, self._query(features)
+        return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 
     def localize_features(self, features: Features, camera: pycolmap.Camera) -> Localization:
         """Localize an image by features that its map's extractor gave."""
-        return self._localize(features, camera, 0.0)
+        return self._localized(features, camera, 0.0)
 
-    def _localize(self, features: Features, camera: pycolmap.Camera, extract_seconds: float) -> Localization:
-        start = perf_counter()
-        matches = self._strategy.match(self._unit_rows(features.descriptors))
-        matched = perf_counter()
-        pose = estimate_pose(
-            features.keypoints[matches.keypoints].astype(np.float64),
-            self._map.points3D_in_world[matches.points],
-            camera,
-            self._options.ransac,
+    def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[Attempt]:
+        """Everything that the strategy would try, round by round, without an early stop."""
+        return self._search.attempts(self._query(features), camera)
+
+    def _localized(self, features: Features, camera: pycolmap.Camera, extract_seconds: float) -> Localization:
+        query = self._query(features)
+        return self._localization(query, self._search.run(query, camera), extract_seconds)
+
+    def _localization(self, query: Query, found: Found, extract_seconds: float) -> Localization:
+        matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
+        if found.best.confidence < self._options.min_confidence:
+            pose = evidence = None
+        return Localization(
+            pose=pose,
+            points2D=query.keypoints[matches.keypoints],
+            points3D_in_world=self.map.points3D_in_world[matches.points],
+            references=found.references,
+            predicted_corner_error=evidence and evidence.predicted_error,
+            seconds=Seconds(extract=extract_seconds, match=found.match_seconds, pose=found.pose_seconds),
         )
-        seconds = Seconds(extract=extract_seconds, match=matched - start, pose=perf_counter() - matched)
-        return Localization(pose=pose, num_matches=len(matches), seconds=seconds)
+
+    def _query(self, features: Features) -> Query:
+        order = np.argsort(-features.scores, kind="stable")
+        if np.any(np.diff(order) < 0):
+            features = features[order]
+        return Query(
+            keypoints=features.keypoints.astype(np.float64), descriptors=self._unit_rows(features.descriptors)
+        )
 
     def _unit_rows(self, descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
         """Rows of unit length, in memory that each thread uses again: fresh pages are dear."""
@@ -137,12 +203,21 @@ class Localizer:
             memory = self._memory.rows = np.empty((count, dimensions), np.float32)
         return unit_rows(descriptors, out=memory[:count])
 
-    def _map_camera(self, image: Image) -> pycolmap.Camera:
+    def camera_of(self, image: Image, given: pycolmap.Camera | None = None) -> pycolmap.Camera:
+        """The intrinsics of an image: those given, else those of the map, scaled.
+
+        Raises:
+            ValueError: There are none, or they are of an image of another size.
+        """
         height, width = image.shape[:2]
-        shared = self._map.shared_camera
-        camera = shared and scaled_camera(shared, width, height)
+        shared = self.map.shared_camera
+        camera = given or (shared and scaled_camera(shared, width, height))
         if camera is None:
             raise ValueError(
                 f"camera must be given: the map has no one camera for an image of {width}x{height} pixels"
+            )
+        if (camera.width, camera.height) != (width, height):
+            raise ValueError(
+                f"camera must be of the image's size {width}x{height}, got {camera.width}x{camera.height}"
             )
         return camera

@@ -11,9 +11,16 @@ import pycolmap
 from slimsfm.errors import OutputError
 from slimsfm.files import replacing
 from slimsfm.localization.localizer import Localization
+from slimsfm.pose import PoseEstimate
 
 Results = Mapping[str, Localization]
 """What became of each query, by image name."""
+
+ObjectResults = Mapping[str, Results]
+"""The same by object, where several were sought in each image."""
+
+_Row = tuple[dict[str, str], Localization]
+"""Object, where there are several, and name of a query, and what became of it."""
 
 
 def write_poses(path: Path, results: Results, *, overwrite: bool = False) -> None:
@@ -27,17 +34,39 @@ def write_poses(path: Path, results: Results, *, overwrite: bool = False) -> Non
     Raises:
         OutputError: The suffix is none of these, or the file cannot be written.
     """
+    _write(path, [({"name": name}, one) for name, one in results.items()], overwrite=overwrite)
+
+
+def write_object_poses(path: Path, results: ObjectResults, *, overwrite: bool = False) -> None:
+    """Write the poses of several objects, image by image, as .json or .csv.
+
+    Raises:
+        OutputError: The suffix is neither of these, or the file cannot be written.
+    """
+    writer_for(path, several=True)
+    names = dict.fromkeys(name for of_object in results.values() for name in of_object)
+    rows = [
+        ({"object": key, "name": name}, of_object[name])
+        for name in names
+        for key, of_object in results.items()
+    ]
+    _write(path, rows, overwrite=overwrite)
+
+
+def _write(path: Path, rows: list[_Row], *, overwrite: bool) -> None:
     write = writer_for(path)
     with replacing(path, overwrite=overwrite) as partial, partial.open("w", newline="") as file:
-        write(file, results)
+        write(file, rows)
 
 
-def writer_for(path: Path) -> Callable[[TextIO, Results], None]:
+def writer_for(path: Path, *, several: bool = False) -> Callable[[TextIO, list[_Row]], None]:
     """The format that a path names.
 
     Raises:
-        OutputError: It names none.
+        OutputError: It names none, or one that has no place for several objects.
     """
+    if several and path.suffix not in _WITH_OBJECTS:
+        raise OutputError(f"{path}: poses of several objects are written as .json or .csv")
     if path.name == "images.txt":
         return _write_colmap
     if path.suffix not in _WRITERS:
@@ -47,21 +76,34 @@ def writer_for(path: Path) -> Callable[[TextIO, Results], None]:
     return _WRITERS[path.suffix]
 
 
-def _write_json(file: TextIO, results: Results) -> None:
+def _write_json(file: TextIO, rows: list[_Row]) -> None:
     images = [
         {
-            "name": name,
+            **label,
             "localized": one.pose is not None,
             "cam_from_world": one.pose and _pose_to_json(one.pose.cam_from_world),
+            "confidence": one.pose and one.pose.confidence,
+            "predicted_corner_error": one.predicted_corner_error,
+            "covariance": one.pose and _covariance_to_json(one.pose),
             "inliers": one.pose.num_inliers if one.pose else 0,
             "matches": one.num_matches,
+            "references_tried": one.references,
             **_milliseconds(one),
         }
-        for name, one in results.items()
+        for label, one in rows
     ]
-    convention = "cam_from_world: x_in_cam = R @ x_in_world + t; quaternions are x, y, z, w"
+    convention = (
+        "cam_from_world: x_in_cam = R @ x_in_world + t; quaternions are x, y, z, w; "
+        "confidence: probability of a corner error below a tenth of the box's diagonal; "
+        "predicted_corner_error: over the diagonal; "
+        "covariance: of a turn (radians) and then a shift (map units) in the camera's frame"
+    )
     json.dump({"convention": convention, "images": images}, file, indent=2)
     file.write("\n")
+
+
+def _covariance_to_json(pose: PoseEstimate) -> list[list[float]] | None:
+    return None if pose.covariance is None else pose.covariance.tolist()
 
 
 def _pose_to_json(cam_from_world: pycolmap.Rigid3d) -> dict:
@@ -79,14 +121,15 @@ def _milliseconds(one: Localization) -> dict[str, float]:
     }
 
 
-def _write_csv(file: TextIO, results: Results) -> None:
+def _write_csv(file: TextIO, rows: list[_Row]) -> None:
     times = ["ms_extract", "ms_match", "ms_pose", "ms_total"]
+    pose = ["qw", "qx", "qy", "qz", "tx", "ty", "tz", "confidence", "inliers", "matches"]
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["name", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "inliers", "matches", *times])
-    for name, one in results.items():
-        values = _colmap_values(one.pose.cam_from_world) if one.pose else [""] * 7
+    writer.writerow([*(rows[0][0] if rows else ["name"]), *pose, *times])
+    for label, one in rows:
+        values = [*_colmap_values(one.pose.cam_from_world), one.pose.confidence] if one.pose else [""] * 8
         inliers = one.pose.num_inliers if one.pose else 0
-        writer.writerow([name, *values, inliers, one.num_matches, *_milliseconds(one).values()])
+        writer.writerow([*label.values(), *values, inliers, one.num_matches, *_milliseconds(one).values()])
 
 
 def _colmap_values(cam_from_world: pycolmap.Rigid3d) -> list[float]:
@@ -95,23 +138,25 @@ def _colmap_values(cam_from_world: pycolmap.Rigid3d) -> list[float]:
     return [w, x, y, z, *cam_from_world.translation.tolist()]
 
 
-def _write_tum(file: TextIO, results: Results) -> None:
-    for index, one in enumerate(results.values()):
+def _write_tum(file: TextIO, rows: list[_Row]) -> None:
+    for index, (_, one) in enumerate(rows):
         if one.pose:
             world_from_cam = one.pose.cam_from_world.inverse()
             values = [*world_from_cam.translation, *world_from_cam.rotation.quat]
             file.write(f"{index} " + " ".join(repr(float(value)) for value in values) + "\n")
 
 
-def _write_colmap(file: TextIO, results: Results) -> None:
+def _write_colmap(file: TextIO, rows: list[_Row]) -> None:
     file.write("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then an empty line: no keypoints\n")
-    for index, (name, one) in enumerate(results.items(), start=1):
+    for index, (label, one) in enumerate(rows, start=1):
         if one.pose:
             values = " ".join(repr(value) for value in _colmap_values(one.pose.cam_from_world))
-            file.write(f"{index} {values} 1 {name}\n\n")
+            file.write(f"{index} {values} 1 {label['name']}\n\n")
 
 
-_WRITERS: dict[str, Callable[[TextIO, Results], None]] = {
+_WITH_OBJECTS = (".json", ".csv")
+
+_WRITERS: dict[str, Callable[[TextIO, list[_Row]], None]] = {
     ".json": _write_json,
     ".csv": _write_csv,
     ".txt": _write_tum,

@@ -10,6 +10,7 @@ from slimsfm.errors import InputError
 from slimsfm.features import Extractor, load_extractor
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
+from slimsfm.mapping.appearance import with_appearance
 from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.cameras import CameraSharing, guess_cameras
 from slimsfm.mapping.extraction import color_points, extract_features
@@ -124,7 +125,8 @@ def build_map(
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
     )
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    return _build(Map(model=model, features=features, matches=matches, info=info), names)
+    made = Map(model=model, features=features, matches=matches, info=info)
+    return _build(with_appearance(made), names)
 
 
 def _build(map: Map, names: list[str]) -> Build:

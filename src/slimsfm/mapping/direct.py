@@ -18,8 +18,8 @@ def direct_map(map: Map, chosen: PointDescriptors) -> Map:
     model = copy_images(map, list(map.images), keypoints=False)
     copy_points(map, model, {point3D_id: [] for point3D_id in map.point3D_ids[chosen.points].tolist()})
     points = np.arange(len(chosen.points), dtype=np.int64)
-    descriptors = PointDescriptors(points=points, descriptors=chosen.descriptors)
-    return replace(map, model=model, features={}, matches={}, point_descriptors=descriptors)
+    descriptors = replace(chosen, points=points)
+    return replace(map, model=model, features={}, matches={}, appearance=None, point_descriptors=descriptors)
 
 
 def with_points(slim: Map, map: Map, chosen: PointDescriptors) -> Map:
@@ -37,4 +37,4 @@ def with_points(slim: Map, map: Map, chosen: PointDescriptors) -> Map:
     copy_points(map, model, {i: track_in(map, i, kept) for i in missing.tolist()})
     joined = replace(slim, model=model)
     rows = np.searchsorted(joined.point3D_ids, wanted)
-    return replace(joined, point_descriptors=PointDescriptors(points=rows, descriptors=chosen.descriptors))
+    return replace(joined, point_descriptors=replace(chosen, points=rows))

@@ -12,6 +12,7 @@ from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
+from slimsfm.mapping.appearance import with_appearance
 from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, read_model
@@ -88,7 +89,8 @@ def import_model(
         box_source="given" if given_box else "estimated",
         origin=f"imported COLMAP model with descriptors from {source.origin}",
     )
-    return Map(model=model, features=source.features, matches=source.matches, info=info)
+    made = Map(model=model, features=source.features, matches=source.matches, info=info)
+    return with_appearance(made)
 
 
 def _find_source(

@@ -4,6 +4,7 @@ MAP/
   sparse/       COLMAP model, opens in COLMAP, pycolmap and hloc
   features.h5   local features in hloc's layout
   matches.h5    verified matches in hloc's layout; may be missing
+  global.npz    global descriptors of the images; may be missing
   points.npz    points to match directly; may be missing, or there instead of features.h5 and matches.h5
   map.json      format version, extractor and its options, box, unit, origin
 """
@@ -19,6 +20,7 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
+from slimsfm.mapping.appearance import read_appearance, write_appearance
 from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
 from slimsfm.mapping.point_file import read_point_descriptors, write_point_descriptors
@@ -39,7 +41,7 @@ def read_map(path: Path) -> Map:
         points = path / "points.npz"
         direct = read_point_descriptors(points, model.num_points3D()) if points.exists() else None
         names = sorted(model.image(i).name for i in model.reg_image_ids())
-        matches = path / "matches.h5"
+        matches, appearance = path / "matches.h5", path / "global.npz"
         features = (
             None if direct and not (path / "features.h5").exists() else FeatureFile(path / "features.h5")
         )
@@ -48,6 +50,7 @@ def read_map(path: Path) -> Map:
             features={} if features is None else features,
             matches=MatchFile(matches, names) if matches.exists() else {},
             point_descriptors=direct,
+            appearance=read_appearance(appearance, len(names)) if appearance.exists() else None,
             info=info,
         )
         check_map(map_)
@@ -75,6 +78,8 @@ def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
         if map.matches:
             counts = {name: image.num_points2D() for name, image in map.images.items()}
             write_matches(partial / "matches.h5", map.matches, counts)
+        if map.appearance:
+            write_appearance(partial / "global.npz", map.appearance)
         if map.point_descriptors:
             write_point_descriptors(partial / "points.npz", map.point_descriptors)
         (partial / "map.json").write_text(json.dumps(_info_to_json(map.info), indent=2) + "\n")
@@ -103,7 +108,7 @@ def bytes_by_part(path: Path) -> dict[str, int]:
     sizes = {
         part.name: sum(file.stat().st_size for file in [part, *part.rglob("*")] if file.is_file())
         for part in sorted(path.iterdir())
-        if part.name in ("sparse", "features.h5", "matches.h5", "points.npz", "map.json")
+        if part.name in ("sparse", "features.h5", "matches.h5", "global.npz", "points.npz", "map.json")
     }
     return {**sizes, "total": sum(sizes.values())}
 

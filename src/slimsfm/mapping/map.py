@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 import pycolmap
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
+from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, IndexPairs, Points3D
 from slimsfm.errors import MapError
@@ -59,6 +60,28 @@ class PointDescriptors:
     descriptors: Descriptors
     """For each of them its descriptor."""
 
+    directions: Float32[np.ndarray, "n 3"] | None = None
+    """For each of them where it was seen from: the mean of the unit vectors towards the cameras that observe
+    it, the shorter the more these differ; None in maps of old, which tell nothing of it."""
+
+    def __getitem__(self, rows: Ids) -> "PointDescriptors":
+        """Some of them, in this order."""
+        directions = None if self.directions is None else self.directions[rows]
+        return PointDescriptors(
+            points=self.points[rows], descriptors=self.descriptors[rows], directions=directions
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Appearance:
+    """What the reference images look like as a whole."""
+
+    words: Float32[np.ndarray, "words d"]
+    """The words that global descriptors are made by, see `features.vlad`."""
+
+    rows: Float32[np.ndarray, "images values"]
+    """For each reference image, in order of name, its global descriptor, of unit length."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Map:
@@ -76,6 +99,9 @@ class Map:
 
     matches: Mapping[tuple[str, str], IndexPairs] = field(default_factory=dict)
     """Verified matches by pair of image names; empty where the map has none."""
+
+    appearance: Appearance | None = None
+    """By what reference images that resemble a query are found; None where it has to be made anew."""
 
     info: MapInfo
     """Extractor, box, unit and origin."""
@@ -148,6 +174,16 @@ class Map:
         """The camera of all reference images, or None where they have several."""
         ids = {image.camera_id for image in self.images.values()}
         return self.model.camera(ids.pop()) if len(ids) == 1 else None
+
+
+def observed(map: Map) -> csr_array:
+    """Which images observe which points: a boolean matrix [images, points]."""
+    points = [np.unique(seen.points) for seen in map.observations.values()]
+    columns = np.concatenate(points)
+    starts = np.concatenate([[0], np.cumsum([len(one) for one in points])])
+    return csr_array(
+        (np.ones(len(columns), bool), columns, starts), shape=(len(points), len(map.point3D_ids))
+    )
 
 
 def check_map(map: Map) -> None:

@@ -7,12 +7,14 @@ saves.
 
 import lzma
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from slimsfm.arrays import Descriptors
 from slimsfm.errors import InputError
@@ -20,10 +22,13 @@ from slimsfm.features import unit_rows
 from slimsfm.mapping.map import PointDescriptors
 
 _LEVELS = 15
-_UNREADABLE = (
+_INT8_MAX = np.iinfo(np.int8).max
+UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError),
     *(BadZipFile, RuntimeError, zlib.error, lzma.LZMAError),  # what zip and its parts raise
 )
+"""What reading a damaged file of arrays may raise."""
+
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes have no context
 
 
@@ -61,19 +66,39 @@ def quantize(descriptors: Descriptors) -> Quantized:
     return Quantized(codes=packed, dimensions=descriptors.shape[1], low=low, high=high)
 
 
+def pack(rows: Descriptors) -> dict[str, np.ndarray]:
+    """Rows of unit length as arrays to store, quantized and compressed; there must be one."""
+    quantized = quantize(rows)
+    packed = lzma.compress(quantized.codes.tobytes(), filters=_FILTERS)
+    return {
+        "codes": np.frombuffer(packed, np.uint8),
+        "range": np.array([quantized.low, quantized.high]),
+        "dimensions": np.array(quantized.dimensions, np.uint32),
+    }
+
+
+def unpack(arrays: Mapping[str, np.ndarray], count: int) -> Descriptors:
+    """The rows again, of which there must be so many.
+
+    Raises:
+        ValueError: There are more or fewer; damaged arrays raise any of `UNREADABLE`.
+    """
+    codes = np.frombuffer(lzma.decompress(arrays["codes"].tobytes()), np.uint8)
+    (low, high), dimensions = arrays["range"].tolist(), int(arrays["dimensions"])
+    return Quantized(
+        codes=codes.reshape(count, (dimensions + 1) // 2), dimensions=dimensions, low=low, high=high
+    ).restore()
+
+
 def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
     """Write descriptors of points, quantized and packed."""
-    quantized = quantize(points.descriptors)
-    packed = lzma.compress(quantized.codes.tobytes(), filters=_FILTERS)
     steps = np.diff(points.points, prepend=-1).astype(np.uint32)  # mostly 1, which packs well
+    arrays: dict[str, Any] = pack(points.descriptors)
+    arrays["points"] = np.frombuffer(lzma.compress(steps.tobytes()), np.uint8)
+    if points.directions is not None:
+        arrays["directions"] = np.round(_INT8_MAX * points.directions).astype(np.int8)
     with path.open("wb") as file:
-        np.savez(
-            file,
-            points=np.frombuffer(lzma.compress(steps.tobytes()), np.uint8),
-            codes=np.frombuffer(packed, np.uint8),
-            range=np.array([quantized.low, quantized.high]),
-            dimensions=np.array(quantized.dimensions, np.uint16),
-        )
+        np.savez(file, **arrays)
 
 
 def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
@@ -85,14 +110,16 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
     try:
         with path.open("rb") as opened, np.load(opened) as file:
             steps = np.frombuffer(lzma.decompress(file["points"].tobytes()), np.uint32)
-            codes = np.frombuffer(lzma.decompress(file["codes"].tobytes()), np.uint8)
-            (low, high), dimensions = file["range"].tolist(), int(file["dimensions"])
-        points = np.cumsum(steps, dtype=np.int64) - 1
-        if not len(points) or points[-1] >= num_points or not steps.all():
-            raise ValueError(f"its rows are not those of {num_points} points")
-        quantized = Quantized(
-            codes=codes.reshape(len(points), (dimensions + 1) // 2), dimensions=dimensions, low=low, high=high
-        )
-        return PointDescriptors(points=points, descriptors=quantized.restore())
-    except _UNREADABLE as error:
+            points = np.cumsum(steps, dtype=np.int64) - 1
+            if not len(points) or points[-1] >= num_points or not steps.all():
+                raise ValueError(f"its rows are not those of {num_points} points")
+            directions = _unpack_directions(file, len(points)) if "directions" in file else None
+            return PointDescriptors(
+                points=points, descriptors=unpack(file, len(points)), directions=directions
+            )
+    except UNREADABLE as error:
         raise InputError(f"{path}: damaged ({error}); make the map again with `slimsfm reduce`") from error
+
+
+def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[np.ndarray, "n 3"]:
+    return arrays["directions"].reshape(count, 3).astype(np.float32) / _INT8_MAX

@@ -9,7 +9,7 @@ import pycolmap
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features import Features
-from slimsfm.mapping.map import Map, check_has_features
+from slimsfm.mapping.map import Appearance, Map, check_has_features
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -38,7 +38,21 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
     features: Mapping[str, Features] = Selection(map.features, chosen.__contains__)
     matches: Mapping[tuple[str, str], IndexPairs] = Selection(map.matches, chosen.issuperset)
     model = _subset_model(map, kept, min_track_length)
-    return replace(map, model=model, features=features, matches=matches, point_descriptors=None)
+    return replace(
+        map,
+        model=model,
+        features=features,
+        matches=matches,
+        appearance=_appearance_of(map, chosen),
+        point_descriptors=None,
+    )
+
+
+def _appearance_of(map: Map, chosen: frozenset[str]) -> Appearance | None:
+    if map.appearance is None:
+        return None
+    rows = [row for row, name in enumerate(map.images) if name in chosen]
+    return Appearance(words=map.appearance.words, rows=map.appearance.rows[rows])
 
 
 class Selection(Mapping[Key, Value]):

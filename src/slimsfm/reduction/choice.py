@@ -83,7 +83,7 @@ class Maker:
 
     def described(self, points: Ids) -> PointDescriptors:
         """Points with their descriptors."""
-        return PointDescriptors(points=points, descriptors=self._described.descriptors[points])
+        return self._described[points]
 
     @cached_property
     def _described(self) -> PointDescriptors:

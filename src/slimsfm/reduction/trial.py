@@ -17,13 +17,13 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors
-from slimsfm.localization.exhaustive import Target, match_targets, reference_target
-from slimsfm.mapping.map import Map
+from slimsfm.localization.references import match_targets, reference_target
+from slimsfm.localization.strategy import Target
+from slimsfm.mapping.map import Map, observed
 from slimsfm.mapping.point_file import quantize
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.selection.left_out import LeftOut
-from slimsfm.selection.views import observed
 
 _MOST_TESTS = 60
 _LOST = 0.5  # of the right matches of a test, at most

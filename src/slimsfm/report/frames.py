@@ -77,13 +77,13 @@ def draw_frame(frame: QueryFrame, box: Box) -> Image:
     drawn = np.ascontiguousarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
     # the true box is the thicker, so that it shows where the two coincide
     if frame.true_cam_from_world is not None:
-        _draw_box(drawn, box, frame.true_cam_from_world, camera, TRUE_RGB, thickness=4)
+        draw_box(drawn, box, frame.true_cam_from_world, camera, TRUE_RGB, thickness=4)
     if frame.estimated_cam_from_world is not None:
-        _draw_box(drawn, box, frame.estimated_cam_from_world, camera, ESTIMATED_RGB, thickness=2)
+        draw_box(drawn, box, frame.estimated_cam_from_world, camera, ESTIMATED_RGB, thickness=2)
     return drawn
 
 
-def _draw_box(
+def draw_box(
     image: Image,
     box: Box,
     cam_from_world: pycolmap.Rigid3d,
@@ -92,6 +92,7 @@ def _draw_box(
     *,
     thickness: int,
 ) -> None:
+    """Draw the edges of a box into an image, as a camera sees them under a pose."""
     for i, j in BOX_EDGES:
         edge = cam_from_world * box.corners[[i, j]]
         clipped = _before_camera(edge, _NEAR * box.diagonal)

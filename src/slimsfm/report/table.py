@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
-from slimsfm.evaluation.metrics import ADD_FRACTIONS, DEG_CM
+from slimsfm.evaluation.metrics import ADD_FRACTIONS, DEG_CM, SURE
 from slimsfm.evaluation.table import Row
 from slimsfm.report.words import number, size
 
@@ -28,6 +28,10 @@ class Column:
 
 def _decimal(value: float) -> str:
     return f"{value:.1f}"
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.1f}"
 
 
 def _percent_of_d(value: float) -> str:
@@ -57,6 +61,18 @@ _RELATIVE = (
     Column("Median error", "median corner error, in % of d", "median_corner_error", _percent_of_d),
 )
 
+_TRUST = (
+    Column(
+        "Wrong when sure",
+        "% beyond 0.1 of the diagonal among poses with confidence over 0.9",
+        f"confidence_wrong_at_{SURE}",
+        _percent,
+    ),
+    Column(
+        "Tried", "reference images that a query was matched with, on average", "references_tried", _decimal
+    ),
+)
+
 _SPEED = (
     Column("Extract ms", "milliseconds a query: its features", "ms_extract", _decimal),
     Column("Match ms", "milliseconds a query: matching", "ms_match", _decimal),
@@ -68,7 +84,7 @@ _SPEED = (
 def table_html(rows: Sequence[Row]) -> str:
     """The rows as a table; what has no value shows as a dash and sorts last."""
     metric = any(row.scores.deg_cm is not None for row in rows)
-    columns = (*_MAP, *(_METRIC if metric else ()), *_RELATIVE, *_SPEED)
+    columns = (*_MAP, *(_METRIC if metric else ()), *_RELATIVE, *_TRUST, *_SPEED)
     heads = [_head("Strategy", "how queries are matched"), _head("Map", "which variant of the map")]
     heads += [_head(column.title, column.meaning) for column in columns]
     lines = "\n".join(f"<tr>{_cells(row, columns)}</tr>" for row in rows)

@@ -12,8 +12,8 @@ from scipy.sparse import csr_array
 
 from slimsfm.arrays import Ids, Points3D
 from slimsfm.features import match_nearest
-from slimsfm.geometry import reprojection_errors
-from slimsfm.mapping.map import Map
+from slimsfm.geometry import motions, reprojection_errors
+from slimsfm.mapping.map import Map, observed
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.selection.left_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem, Twists
@@ -44,16 +44,6 @@ def selection_problem(map: Map, left_out: LeftOut, progress: ProgressBar = silen
             [_twists(map, name, points) for name, points in zip(names, found, strict=True)]
         ),
         corner_twists=np.stack([_corner_twists(map, name) for name in names]),
-    )
-
-
-def observed(map: Map) -> csr_array:
-    """Which images observe which points: a boolean matrix [images, points]."""
-    points = [np.unique(seen.points) for seen in map.observations.values()]
-    columns = np.concatenate(points)
-    starts = np.concatenate([[0], np.cumsum([len(one) for one in points])])
-    return csr_array(
-        (np.ones(len(columns), bool), columns, starts), shape=(len(points), len(map.point3D_ids))
     )
 
 
@@ -100,8 +90,4 @@ def _corner_twists(map: Map, name: str) -> Float32[np.ndarray, "24 6"]:
 
 def _motions(in_cam: Points3D, diagonal: float) -> Float64[np.ndarray, "n 3 6"]:
     """How points move in the camera's frame when it turns (radians) and shifts (diagonals)."""
-    x, y, z = in_cam.T
-    zero = np.zeros_like(z)
-    turned = np.stack([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
-    shifted = np.tile(diagonal * np.eye(3), (len(in_cam), 1, 1))
-    return np.concatenate([turned, shifted], axis=2)
+    return motions(in_cam) * np.array([1, 1, 1, diagonal, diagonal, diagonal])

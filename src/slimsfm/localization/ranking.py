@@ -1,0 +1,22 @@
+"""Which reference images resemble a query."""
+
+import numpy as np
+from jaxtyping import Float32
+
+from slimsfm.features.vlad import vlad
+from slimsfm.localization.strategy import Query
+from slimsfm.mapping.appearance import describe_images
+from slimsfm.mapping.map import Map
+
+_STRONGEST = 2048  # keypoints that tell what a query looks like
+
+
+class Ranking:
+    """Compares a query with all reference images at once, by global descriptors."""
+
+    def __init__(self, map: Map) -> None:
+        self._appearance = map.appearance or describe_images(map)
+
+    def similarities(self, query: Query) -> Float32[np.ndarray, " references"]:
+        """Cosine between the query's global descriptor and that of each reference image, in order of name."""
+        return self._appearance.rows @ vlad(query.descriptors[:_STRONGEST], self._appearance.words)
