@@ -108,19 +108,19 @@ def estimate_pose(
     References:
         [1] Chum, Matas and Kittler, Locally Optimized RANSAC, DAGM 2003.
     """
-    _check_matches(points2D, points3D_in_world)
+    check_matches(points2D, points3D_in_world)
     if camera.is_spherical():
         raise ValueError(f"camera must have a focal length, got the spherical model {camera.model_name}")
     if len(points2D) < options.min_inliers:
         return None
-    pinhole_points2D = _undistort(points2D, camera)
+    pinhole_points2D = undistort(points2D, camera)
     usable = np.flatnonzero(np.isfinite(pinhole_points2D).all(axis=1))
     if len(usable) < options.min_inliers:
         return None
     pose, info = poselib.estimate_absolute_pose(
         pinhole_points2D[usable],
         points3D_in_world[usable],
-        _ideal_pinhole(camera),
+        ideal_pinhole(camera),
         *_poselib_options(options),
     )
     inliers = np.zeros(len(points2D), dtype=bool)
@@ -160,7 +160,12 @@ def pose_covariance(
     return variance * (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T
 
 
-def _check_matches(points2D: Points2D, points3D_in_world: Points3D) -> None:
+def check_matches(points2D: Points2D, points3D_in_world: Points3D) -> None:
+    """Refuse points that do not correspond or are not finite.
+
+    Raises:
+        ValueError: They do not.
+    """
     if len(points2D) != len(points3D_in_world):
         raise ValueError(
             f"points2D and points3D_in_world must match row by row, got {len(points2D)} and "
@@ -172,13 +177,14 @@ def _check_matches(points2D: Points2D, points3D_in_world: Points3D) -> None:
             raise ValueError(f"{name} must be finite, got {points[bad[0]].tolist()} in row {bad[0]}")
 
 
-def _undistort(points2D: Points2D, camera: pycolmap.Camera) -> Points2D:
+def undistort(points2D: Points2D, camera: pycolmap.Camera) -> Points2D:
     """Pixels of a pinhole camera of equal focal length, principal point (0, 0); NaN behind the camera."""
     rays = np.asarray(camera.cam_from_img(points2D), dtype=np.float64).reshape(-1, 2)
     return camera.mean_focal_length() * rays
 
 
-def _ideal_pinhole(camera: pycolmap.Camera) -> dict:
+def ideal_pinhole(camera: pycolmap.Camera) -> dict:
+    """The camera of undistorted pixels, as poselib wants it."""
     focal = camera.mean_focal_length()
     return {
         "model": "SIMPLE_PINHOLE",

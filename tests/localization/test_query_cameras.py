@@ -1,3 +1,5 @@
+from inspect import unwrap
+
 import numpy as np
 import pycolmap
 import pytest
@@ -6,7 +8,8 @@ from PIL import ExifTags, Image
 from scenes import camera
 from slimsfm.errors import ImageError, InputError
 from slimsfm.geometry import project
-from slimsfm.localization.cameras import query_camera, read_camera, scaled_camera
+from slimsfm.localization.cameras import guess_camera, query_camera, read_camera, scaled_camera
+from slimsfm.photos import camera_from_exif
 
 
 def photo(path, size=(640, 480), focal_35mm=None):
@@ -70,8 +73,51 @@ def test_without_any_of_them_the_user_is_asked(exact, two_cameras, tmp_path):
         (exact, photo(tmp_path / "upright.png", (480, 640))),
         (two_cameras, photo(tmp_path / "plain.png")),
     ):
-        with pytest.raises(ImageError, match=f"{path.name}.*--camera FILE"):
+        with pytest.raises(ImageError, match=f"{path.name}.*--camera FILE.*--focal unknown"):
             query_camera(map_, path, None)
+
+
+@pytest.mark.parametrize("focal", ["approximate", "unknown"])
+def test_an_image_whose_focal_length_need_not_be_known_gets_a_guess(focal, exact, two_cameras, tmp_path):
+    for map_, path, size in (
+        (exact, photo(tmp_path / "upright.png", (480, 640)), (480, 640)),
+        (two_cameras, photo(tmp_path / "plain.png"), (640, 480)),
+    ):
+        chosen = query_camera(map_, path, None, focal)
+        assert str(chosen) == str(guess_camera(*size))
+        assert not chosen.has_prior_focal_length
+
+
+@pytest.mark.parametrize("focal", ["approximate", "unknown"])
+def test_whatever_is_known_comes_before_a_guess(focal, exact, two_cameras, tmp_path, px_per_mm):
+    silent = photo(tmp_path / "a.png")
+    assert np.array_equal(query_camera(exact, silent, None, focal).params, camera().params)
+    assert query_camera(exact, silent, camera("SIMPLE_RADIAL"), focal).model_name == "SIMPLE_RADIAL"
+    told = query_camera(two_cameras, photo(tmp_path / "b.jpg", focal_35mm=80), None, focal)
+    assert told.focal_length == pytest.approx(80 * px_per_mm)
+    with pytest.raises(ImageError, match="its --camera 640x480"):
+        query_camera(exact, photo(tmp_path / "c.png", (480, 640)), camera(), focal)
+
+
+def test_another_word_for_the_focal_length_is_refused(exact, tmp_path):
+    with pytest.raises(ValueError, match="focal must be one of known, approximate, unknown, got 'guessed'"):
+        unwrap(query_camera)(exact, photo(tmp_path / "a.png"), None, "guessed")
+
+
+@pytest.mark.parametrize("size", [(640, 480), (480, 640), (1, 1)], ids=str)
+def test_a_guess_is_the_one_of_colmap(size, tmp_path):
+    guess = guess_camera(*size)
+    theirs = camera_from_exif(photo(tmp_path / "a.png", size))
+    assert guess.model_name == "SIMPLE_RADIAL"
+    assert guess.focal_length == 1.2 * max(size)
+    assert np.array_equal(guess.params, theirs.params)
+    assert (guess.width, guess.height) == (theirs.width, theirs.height) == size
+
+
+@pytest.mark.parametrize(("size", "name"), [((0, 480), "width"), ((640, -1), "height")], ids=str)
+def test_no_guess_for_an_image_without_pixels(size, name):
+    with pytest.raises(ValueError, match=f"{name} must be positive"):
+        guess_camera(*size)
 
 
 @pytest.mark.parametrize("size", [(320, 240), (960, 720), (641, 481), (321, 240), (213, 160)], ids=str)

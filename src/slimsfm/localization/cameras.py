@@ -1,6 +1,7 @@
-"""Which intrinsics a query has: given, those of the map, or told by EXIF."""
+"""Which intrinsics a query has: given, those of the map, told by EXIF, or guessed."""
 
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import pycolmap
@@ -9,6 +10,10 @@ from slimsfm.errors import ImageError, InputError
 from slimsfm.mapping.map import Map
 from slimsfm.photos import camera_from_exif
 
+FocalLength = Literal["known", "approximate", "unknown"]
+"""How well the focal length of a query is known; unless it is, it is estimated with the pose."""
+
+_GUESS = 1.2  # focal length over the longer side, as COLMAP guesses
 _SAME_FOCAL = 0.1  # relative difference up to which EXIF speaks of the map's camera, calibrated there better
 
 
@@ -53,15 +58,38 @@ def scaled_camera(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.
     return scaled
 
 
-def query_camera(map: Map, path: Path, given: pycolmap.Camera | None) -> pycolmap.Camera:
+def guess_camera(width: int, height: int) -> pycolmap.Camera:
+    """The camera of an image of which nothing but the size is known, such as one in memory.
+
+    Returns:
+        A SIMPLE_RADIAL camera without distortion, its focal length 1.2 times the longer side;
+        `has_prior_focal_length` is False.
+
+    Raises:
+        ValueError: A side is not positive.
+    """
+    for name, side in (("width", width), ("height", height)):
+        if side < 1:
+            raise ValueError(f"{name} must be positive, got {side}")
+    focal_px = _GUESS * max(width, height)
+    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, width, height)
+
+
+def query_camera(
+    map: Map, path: Path, given: pycolmap.Camera | None, focal: FocalLength = "known"
+) -> pycolmap.Camera:
     """Choose the intrinsics of a query image.
 
     The given camera if there is one; else the camera that all reference images share, unless EXIF tells of
-    another focal length or the image is of another shape; else what EXIF tells.
+    another focal length or the image is of another shape; else what EXIF tells; else, where the focal length
+    need not be known, a guess of 1.2 times the longer side.
 
     Raises:
         ImageError: None of these serves.
+        ValueError: `focal` is none of its values.
     """
+    if focal not in get_args(FocalLength):
+        raise ValueError(f"focal must be one of {', '.join(get_args(FocalLength))}, got {focal!r}")
     exif = camera_from_exif(path)
     candidate = given or map.shared_camera
     scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
@@ -74,9 +102,12 @@ def query_camera(map: Map, path: Path, given: pycolmap.Camera | None) -> pycolma
         return scaled
     if exif.has_prior_focal_length:
         return exif
-    raise ImageError(
-        f"{path}: its focal length is unknown (no EXIF, and not of the map's camera); give --camera FILE"
-    )
+    if focal == "known":
+        raise ImageError(
+            f"{path}: its focal length is unknown (no EXIF, and not of the map's camera); "
+            "give --camera FILE, or have it estimated with --focal unknown"
+        )
+    return guess_camera(exif.width, exif.height)
 
 
 def _same_focal(a: pycolmap.Camera, b: pycolmap.Camera) -> bool:
