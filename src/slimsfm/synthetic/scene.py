@@ -13,6 +13,14 @@ from slimsfm.synthetic import shapes, texture, trajectory
 from slimsfm.synthetic.objects import OBJECTS
 from slimsfm.synthetic.render import Light, Scene, render
 
+EVENING = Light(
+    towards=(-0.8, 0.5, 0.7),
+    lamp=(0.62, 0.56, 0.45),
+    ambient=(0.44, 0.46, 0.50),
+    backdrop=(52.0, 60.0, 74.0),
+)
+"""Lower, warmer and from the other side than what shines while an object is mapped."""
+
 NOISE_SIGMA = 1.5
 """Standard deviation of the sensor's noise, in grey levels of 0 to 255."""
 
@@ -28,9 +36,13 @@ class Take:
 
     def frame(self, index: int) -> Image:
         """Render one frame, with the noise of the sensor; equal calls give equal images."""
-        image = render(self.scene, self.camera, self.cam_from_object[index])
-        noise = np.random.default_rng([*self.seed, index]).standard_normal(image.shape, np.float32)
-        return np.clip(np.rint(image + NOISE_SIGMA * noise), 0, 255).astype(np.uint8)
+        return with_noise(render(self.scene, self.camera, self.cam_from_object[index]), (*self.seed, index))
+
+
+def with_noise(image: Image, seed: tuple[int, ...]) -> Image:
+    """Add the noise of the sensor."""
+    noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image + NOISE_SIGMA * noise), 0, 255).astype(np.uint8)
 
 
 def object_box(mesh: trimesh.Trimesh) -> Box:
@@ -52,12 +64,12 @@ def mapping_take(name: str, frames: int, width: int, height: int, seed: int) -> 
     Raises:
         ValueError: There is no object of that name.
     """
-    mesh, key = _object(name, seed), (seed, sorted(OBJECTS).index(name), 0)
+    mesh, key = textured_object(name, seed), (seed, sorted(OBJECTS).index(name), 0)
     rng = np.random.default_rng(key)
     wood = texture.tinted_noise(rng, 512, 512, (186, 178, 168), 0.16)
     scene = Scene([mesh, shapes.ground(2.4, wood, shapes.lowest(mesh))], Light())
-    path = trajectory.mapping_path(frames, _distance(mesh))
-    return Take(scene=scene, camera=_camera(width, height, 0.0), cam_from_object=tuple(path), seed=key)
+    path = trajectory.mapping_path(frames, viewing_distance(mesh))
+    return Take(scene=scene, camera=pinhole(width, height, 0.0), cam_from_object=tuple(path), seed=key)
 
 
 def query_take(name: str, frames: int, width: int, height: int, seed: int) -> Take:
@@ -73,60 +85,63 @@ def query_take(name: str, frames: int, width: int, height: int, seed: int) -> Ta
     Raises:
         ValueError: There is no object of that name.
     """
-    mesh, key = _object(name, seed), (seed, sorted(OBJECTS).index(name), 1)
+    mesh, key = textured_object(name, seed), (seed, sorted(OBJECTS).index(name), 1)
     rng = np.random.default_rng(key)
-    floor = shapes.lowest(mesh)
-    cloth = texture.page(rng, 2000, 2000, cell=150) // 4 + 110
-    light = Light(
-        towards=(-0.8, 0.5, 0.7),
-        lamp=(0.62, 0.56, 0.45),
-        ambient=(0.44, 0.46, 0.50),
-        backdrop=(52.0, 60.0, 74.0),
-    )
-    meshes = [mesh, shapes.ground(2.4, cloth, floor), *_posts(rng, mesh), *_things(rng, mesh)]
-    path = trajectory.query_path(rng, frames, 1.3 * _distance(mesh))
-    return Take(
-        scene=Scene(meshes, light), camera=_camera(width, height, 0.02), cam_from_object=tuple(path), seed=key
-    )
+    scene = elsewhere(rng, mesh)
+    path = trajectory.query_path(rng, frames, 1.3 * viewing_distance(mesh))
+    return Take(scene=scene, camera=pinhole(width, height, 0.02), cam_from_object=tuple(path), seed=key)
 
 
 TAKES: dict[str, Callable[[str, int, int, int, int], Take]] = {"mapping": mapping_take, "query": query_take}
 
 
-def _object(name: str, seed: int) -> trimesh.Trimesh:
+def textured_object(name: str, seed: int) -> trimesh.Trimesh:
+    """The object of a name.
+
+    Raises:
+        ValueError: There is no object of that name.
+    """
     if name not in OBJECTS:
         raise ValueError(f"name must be one of {', '.join(OBJECTS)}, got {name!r}")
     return OBJECTS[name](seed)
 
 
-def _distance(mesh: trimesh.Trimesh) -> float:
+def elsewhere(rng: np.random.Generator, mesh: trimesh.Trimesh) -> Scene:
+    """An object in evening light on a patterned table, with things around it and posts in front of it."""
+    cloth = texture.page(rng, 2000, 2000, cell=150) // 4 + 110
+    table = shapes.ground(2.4, cloth, shapes.lowest(mesh))
+    return Scene([mesh, table, *posts(rng, mesh), *things(rng, mesh)], EVENING)
+
+
+def viewing_distance(mesh: trimesh.Trimesh) -> float:
     """From where a mesh fills a good part of the image."""
     return 1.5 * object_box(mesh).diagonal
 
 
-def _camera(width: int, height: int, change: float) -> pycolmap.Camera:
+def pinhole(width: int, height: int, change: float) -> pycolmap.Camera:
+    """A camera that sees 56 degrees from left to right, its centre slightly off; `change` tells two apart."""
     focal = 600 / 640 * width * (1 + change)
     center = (width * (0.5 + 0.006 - change), height * (0.5 - 0.008 + change))
     return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[focal, focal, *center])
 
 
-def _posts(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+def posts(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Three thin posts around an object: each hides a part of it where the camera passes low behind it."""
     x, y, z = mesh.extents
     around, height = 0.5 * float(np.hypot(x, y)) + 0.04, 1.2 * z
-    posts = []
+    made = []
     for azimuth in np.radians([20.0, 140.0, 260.0]):
         radius = 0.062 * float(abs(x * np.sin(azimuth)) + abs(y * np.cos(azimuth)))
         label = texture.page(rng, 300, 120, cell=60)
         post = shapes.lathe([radius, radius], [height / 2, -height / 2], label, [label[:64, :64]] * 2)
         place = (around * np.cos(azimuth), around * np.sin(azimuth), shapes.lowest(mesh) + height / 2)
-        posts.append(post.apply_translation(place))
-    return posts
+        made.append(post.apply_translation(place))
+    return made
 
 
-def _things(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+def things(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Seven printed boxes and cylinders in a ring, low enough not to hide the object."""
-    around, things = 0.5 * float(np.linalg.norm(mesh.extents)) + 0.13, []
+    around, made = 0.5 * float(np.linalg.norm(mesh.extents)) + 0.13, []
     for azimuth in 2 * np.pi * (np.arange(7) + rng.uniform(-0.2, 0.2, 7)) / 7:
         size = rng.uniform((0.06, 0.05, 0.04), (0.12, 0.10, 0.45 * mesh.extents[2]))
         images = [texture.page(rng, 220, 260, cell=80) for _ in range(6)]
@@ -135,7 +150,7 @@ def _things(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Tri
         else:
             thing = shapes.box(size.tolist(), images)
         thing.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, np.pi), (0, 0, 1)))
-        distance = around + rng.uniform(0, 0.08)
-        place = (distance * np.cos(azimuth), distance * np.sin(azimuth), shapes.lowest(mesh) + size[2] / 2)
-        things.append(thing.apply_translation(place))
-    return things
+        away = around + rng.uniform(0, 0.08)
+        place = (away * np.cos(azimuth), away * np.sin(azimuth), shapes.lowest(mesh) + size[2] / 2)
+        made.append(thing.apply_translation(place))
+    return made

@@ -38,8 +38,8 @@ def mapping_path(frames: int, radius: float) -> list[pycolmap.Rigid3d]:
     """
     share = (np.arange(frames) + 0.5) / frames
     azimuths = 2 * np.pi * share * np.sqrt(frames / 8)
-    eyes = _eyes(azimuths, np.radians(10 + 60 * share), radius * (1 + 0.08 * np.sin(7 * share)))
-    return [look_at(eye, np.zeros(3)) for eye in eyes]
+    places = eyes(azimuths, np.radians(10 + 60 * share), radius * (1 + 0.08 * np.sin(7 * share)))
+    return [look_at(eye, np.zeros(3)) for eye in places]
 
 
 def query_path(rng: np.random.Generator, frames: int, radius: float) -> list[pycolmap.Rigid3d]:
@@ -55,17 +55,20 @@ def query_path(rng: np.random.Generator, frames: int, radius: float) -> list[pyc
     share = (np.arange(frames) + 0.5) / frames
     elevations = np.radians(38 + 20 * np.sin(2 * np.pi * (2.3 * share + 0.15)))
     radii = radius * (1 + 0.22 * np.sin(2 * np.pi * (1.7 * share + 0.4)))
-    eyes = _eyes(0.6 - 2 * np.pi * share, elevations, radii)
+    places = eyes(0.6 - 2 * np.pi * share, elevations, radii)
     targets = rng.uniform(-0.08, 0.08, (frames, 3)) * radius
     rolls = 15 * np.sin(2 * np.pi * 3 * share) * rng.uniform(0.5, 1, frames)
-    return [look_at(eye, target, float(roll)) for eye, target, roll in zip(eyes, targets, rolls, strict=True)]
+    return [
+        look_at(eye, target, float(roll)) for eye, target, roll in zip(places, targets, rolls, strict=True)
+    ]
 
 
-def _eyes(
+def eyes(
     azimuths: Float64[np.ndarray, " n"],
     elevations: Float64[np.ndarray, " n"],
     radii: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
+    """Where cameras are that see the origin from these directions, in radians, and distances."""
     level = np.cos(elevations)
     unit = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), np.sin(elevations)], axis=1)
     return radii[:, None] * unit

@@ -1,0 +1,96 @@
+"""The film to track, for benchmarks to share: rendered once, kept in the output folder.
+
+    python benchmarks/film_frames.py -o /tmp/film
+
+writes OUTPUT/color_full/0.png ..., OUTPUT/poses_ba/0.txt ... and intrinsics.txt as OnePose has them, and
+OUTPUT/film.npz: visible (share of the object that nothing hides, one a frame), cut (first frame after it) and
+occlusion (first frame wholly hidden, and the first not hidden any more).
+"""
+
+import argparse
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from deceptive_scenes import run_all
+from jaxtyping import Float64
+from PIL import Image as PilImage
+
+from slimsfm.datasets import onepose
+from slimsfm.files import replacing
+from slimsfm.synthetic.film import Film, film
+
+NAME, FRAMES, WIDTH, HEIGHT, SEED = "printed_box", 600, 640, 480, 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FilmFrames:
+    """The frames of the film as files, and what is known of them."""
+
+    sequence: onepose.PosedSequence
+    """Image files, camera and true poses, in the frame of the object."""
+
+    visible: Float64[np.ndarray, " frames"]
+    """Share of the object that nothing hides."""
+
+    cut: int
+    """The first frame after the cut."""
+
+    occlusion: range
+    """The frames in which the object is hidden wholly."""
+
+
+def film_frames(output: Path, *, workers: int = 2) -> FilmFrames:
+    """The film; it is rendered unless the output folder is there already."""
+    if not output.exists():
+        with replacing(output, overwrite=False) as partial:
+            render_film(partial, workers)
+    with np.load(output / "film.npz") as known:
+        return FilmFrames(
+            sequence=onepose.read_sequence(output),
+            visible=known["visible"],
+            cut=int(known["cut"]),
+            occlusion=range(*known["occlusion"].tolist()),
+        )
+
+
+def render_film(folder: Path, workers: int) -> None:
+    """Render every frame and write what is known of them."""
+    made = the_film()
+    onepose.write_annotation(folder, made.camera, made.cam_from_object)
+    ends = (made.occlusion.start, made.occlusion.stop)
+    np.savez(folder / "film.npz", visible=made.visible, cut=made.cut, occlusion=ends)
+    run_all(
+        write_frame,
+        [(index, onepose.image_path(folder, index)) for index in range(FRAMES)],
+        "rendering the film",
+        workers,
+    )
+
+
+@lru_cache(maxsize=1)
+def the_film() -> Film:
+    """The film, made once a process."""
+    return film(NAME, FRAMES, WIDTH, HEIGHT, SEED)
+
+
+def write_frame(job: tuple[int, Path]) -> None:
+    """Render one frame to its file."""
+    index, path = job
+    PilImage.fromarray(the_film().frame(index)).save(path, compress_level=1)
+
+
+def main() -> None:
+    """Render and say what there is."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("-o", "--output", required=True, type=Path)
+    made = film_frames(parser.parse_args().output)
+    print(
+        f"{len(made.sequence.image_paths)} frames; hidden from {made.occlusion.start} "
+        f"to {made.occlusion.stop - 1}; cut before {made.cut}"
+    )
+
+
+if __name__ == "__main__":
+    main()
