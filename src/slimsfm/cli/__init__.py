@@ -14,6 +14,7 @@ COMMANDS = {
     "reduce": "map -> slim map",
     "frontier": "what a map can be reduced to, and what that costs",
     "localize": "poses of new images",
+    "track": "poses of a video, frame by frame",
     "benchmark": "speed and accuracy, full against slim",
     "synthesize": "textured objects with exact ground truth",
     "demo": "all of it, on objects it makes itself",

@@ -1,0 +1,5 @@
+"""Following an object through a video."""
+
+from slimsfm.tracking.tracker import Tracked, Tracker, TrackerOptions
+
+__all__ = ["Tracked", "Tracker", "TrackerOptions"]

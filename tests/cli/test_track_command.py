@@ -1,0 +1,254 @@
+"""`slimsfm track`, on short films of one rendered object."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from commands import contents, slimsfm
+from slimsfm.cli.track_command import _drawn
+from slimsfm.localization import Localizer
+from slimsfm.photos import read_image
+from slimsfm.tracking import Tracker, TrackerOptions
+from slimsfm.tracking.video import open_frames, write_video
+
+
+@pytest.fixture(scope="module")
+def images(boulder):
+    """A still camera, nothing to see, and the object from elsewhere."""
+    here, there = (read_image(boulder.photos / name) for name in ("12.png", "20.png"))
+    return [here, here, here, np.zeros_like(here), there, there]
+
+
+@pytest.fixture(scope="module")
+def video(images, tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "film.mp4"
+    with write_video(path, 25.0) as write:
+        for image in images:
+            write(image)
+    return path
+
+
+@pytest.fixture
+def refused(tmp_path):
+    def check(*arguments, naming):
+        before = contents(tmp_path)
+        outcome = slimsfm("track", *arguments)
+        lines = [line for line in outcome.err.splitlines() if line.strip()]
+        assert (outcome.code, len(lines)) == (2, 1), outcome
+        assert lines[0].startswith("slimsfm: ")
+        assert str(naming) in lines[0]
+        assert contents(tmp_path) == before
+
+    return check
+
+
+def poses_of(path):
+    return {image["name"]: image["cam_from_world"] for image in json.loads(path.read_text())["images"]}
+
+
+def library_poses(map_, source, options=TrackerOptions()):
+    tracker = Tracker(Localizer(map_), options)
+    results = {frame.name: tracker.track(frame.image).pose for frame in open_frames(str(source)).pictures}
+    return {name: pose and as_json(pose.cam_from_world) for name, pose in results.items()}
+
+
+def as_json(cam_from_world):
+    return {
+        "quaternion_xyzw": cam_from_world.rotation.quat.tolist(),
+        "translation": cam_from_world.translation.tolist(),
+    }
+
+
+def test_the_command_gives_the_poses_of_the_library(boulder, video, tmp_path):
+    output = tmp_path / "poses.json"
+    done = slimsfm("track", boulder.map_path, video, "-o", output)
+    assert (done.code, done.err.strip()) == (0, "")
+    told, made, next_line = done.out.splitlines()
+    assert f"{output}: 3 frames tracked, 2 localized on their own, 1 lost; " in told
+    assert told.endswith(" frames a second")
+    assert made.startswith(f"{output}: 6 frames in ")
+    assert next_line == f"next: slimsfm info {boulder.map_path}"
+    poses = poses_of(output)
+    assert poses == library_poses(boulder.map, video)
+    assert [name for name, pose in poses.items() if pose is None] == ["000003"]
+
+
+def test_options_reach_the_tracker(boulder, video, tmp_path):
+    output = tmp_path / "poses.json"
+    arguments = (
+        "--smoothing",
+        5,
+        "--max-image-size",
+        160,
+        "--renew-every",
+        2,
+        "--lag",
+        1,
+        "--max-points",
+        90,
+    )
+    assert slimsfm("track", boulder.map_path, video, "-o", output, *arguments).code == 0
+    options = TrackerOptions(smoothing=5.0, max_image_size=160, renew_every=2, lag=1, max_points=90)
+    assert poses_of(output) == library_poses(boulder.map, video, options)
+
+
+def test_a_folder_is_tracked_image_by_image(boulder, images, tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for i, image in enumerate(images[:3]):
+        Image.fromarray(image).save(folder / f"{i}.png")
+    done = slimsfm("track", boulder.map_path, folder, "-o", tmp_path / "poses.csv")
+    assert done.code == 0
+    assert "2 frames tracked, 1 localized on their own, 0 lost" in done.out
+    names = [line.split(",")[0] for line in (tmp_path / "poses.csv").read_text().splitlines()]
+    assert names == ["name", "0.png", "1.png", "2.png"]
+
+
+def test_a_camera_file_is_heeded(boulder, video, tmp_path):
+    line = "1 PINHOLE 640 480 780 780 320 240\n"
+    (tmp_path / "camera.txt").write_text(line)
+    arguments = (boulder.map_path, video, "--camera", tmp_path / "camera.txt")
+    assert slimsfm("track", *arguments, "-o", tmp_path / "other.json").code == 0
+    assert slimsfm("track", boulder.map_path, video, "-o", tmp_path / "own.json").code == 0
+    own, other = (
+        poses_of(tmp_path / name)["000000"]["translation"][2] for name in ("own.json", "other.json")
+    )
+    assert other > 1.1 * own
+
+
+def test_the_box_is_drawn_where_the_pose_is_sure(boulder, video, images, tmp_path):
+    drawn = tmp_path / "drawn.mp4"
+    done = slimsfm("track", boulder.map_path, video, "-o", tmp_path / "poses.json", "--video", drawn)
+    assert done.code == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drawn.mp4", "poses.json"]
+    frames = [frame.image for frame in open_frames(str(drawn)).pictures]
+    assert len(frames) == len(images)
+    changes = [np.abs(a.astype(int) - b).max(axis=2) for a, b in zip(frames, images, strict=True)]
+    assert all(np.mean(change > 60) > 0.002 for change in changes[:3])
+    assert changes[3].max() < 30  # lost: no box
+
+
+def test_the_surer_a_pose_the_stronger_its_box(boulder, images):
+    map_ = boulder.map
+    camera = map_.shared_camera
+    (sure,) = [Tracker(Localizer(map_)).track(images[0])]
+    changes = []
+    for confidence in (1.0, 0.5, 0.01):
+        pose = sure.pose.__class__(
+            cam_from_world=sure.pose.cam_from_world, inliers=sure.pose.inliers, confidence=confidence
+        )
+        one = sure.__class__(localization=_with_pose(sure.localization, pose), state="tracked", seconds=0.1)
+        drawn = _drawn(images[0], one, map_.box, camera)
+        changes.append(np.abs(drawn.astype(int) - images[0]).sum())
+    assert changes[0] > 1.5 * changes[1] > 2 * changes[2] > 0
+
+
+def _with_pose(localization, pose):
+    return localization.__class__(**{**vars(localization), "pose": pose})
+
+
+class FakeCamera:
+    """Shows some pictures, and then somebody presses Ctrl-C."""
+
+    def __init__(self, images):
+        self.images = [cv2.cvtColor(image, cv2.COLOR_RGB2BGR) for image in images]
+
+    def isOpened(self):
+        return True
+
+    def get(self, _property):
+        return 30.0
+
+    def read(self):
+        if not self.images:
+            raise KeyboardInterrupt
+        return True, self.images.pop(0)
+
+    def release(self):
+        pass
+
+
+def test_ctrl_c_ends_what_a_camera_shows_and_keeps_it(boulder, images, tmp_path, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _index: FakeCamera(images[:3]))
+    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "seen.mp4")
+    done = slimsfm("track", boulder.map_path, 0, *arguments)
+    assert done.code == 0
+    assert list(poses_of(tmp_path / "poses.json")) == ["000000", "000001", "000002"]
+    assert len(list(open_frames(str(tmp_path / "seen.mp4")).pictures)) == 3
+
+
+def test_ctrl_c_before_the_first_frame_leaves_nothing(boulder, tmp_path, monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _index: FakeCamera([]))
+    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "seen.mp4")
+    done = slimsfm("track", boulder.map_path, 0, *arguments)
+    assert done.code == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_videos(refused, boulder, video, tmp_path):
+    (tmp_path / "text.mp4").write_text("no video")
+    half = video.read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(half[: len(half) // 2])
+    (tmp_path / "empty").mkdir()
+    for name in ("text.mp4", "cut.mp4", "empty", "missing.mp4"):
+        source = tmp_path / name
+        refused(boulder.map_path, source, "-o", tmp_path / "poses.json", naming=source)
+    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "drawn.mp4")
+    refused(boulder.map_path, tmp_path / "text.mp4", *arguments, naming=tmp_path / "text.mp4")
+    refused(boulder.map_path, 97, *arguments, naming="97: no camera")
+
+
+def test_a_folder_with_a_broken_or_a_larger_image(refused, boulder, images, tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    Image.fromarray(images[0]).save(folder / "0.png")
+    (folder / "1.png").write_text("no image")
+    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "drawn.mp4")
+    refused(boulder.map_path, folder, *arguments, naming=folder / "1.png")
+    Image.new("RGB", (640, 480)).save(folder / "1.png")
+    refused(boulder.map_path, folder, *arguments, naming="1.png has 640x480 pixels, the first 320x240")
+
+
+def test_bad_maps_outputs_and_options(refused, boulder, video, tmp_path):
+    output = tmp_path / "poses.json"
+    refused(tmp_path / "nowhere", video, "-o", output, naming=tmp_path / "nowhere")
+    refused(boulder.map_path, video, "-o", tmp_path / "poses.xml", naming=tmp_path / "poses.xml")
+    gif = tmp_path / "drawn.gif"
+    refused(
+        boulder.map_path, video, "-o", output, "--video", gif, naming=f"{gif}: videos are written as .mp4"
+    )
+    refused(boulder.map_path, video, naming="see slimsfm track --help")
+    for option, value, naming in (
+        ("--smoothing", -1, "smoothing must not be negative, got -1.0"),
+        ("--lag", 0, "lag must be at least 1, got 0"),
+        ("--camera", tmp_path / "missing.txt", "missing.txt"),
+    ):
+        refused(boulder.map_path, video, "-o", output, option, value, naming=naming)
+
+
+def test_a_camera_of_another_shape(refused, boulder, video, tmp_path):
+    (tmp_path / "camera.txt").write_text("1 PINHOLE 240 320 300 300 120 160\n")
+    arguments = ("-o", tmp_path / "poses.json", "--camera", tmp_path / "camera.txt")
+    refused(
+        boulder.map_path, video, *arguments, naming=f"{video}: 320x240 pixels, is not of --camera 240x320"
+    )
+    with write_video(tmp_path / "upright.mp4", 25.0) as write:
+        write(np.zeros((320, 240, 3), np.uint8))
+    refused(
+        boulder.map_path, tmp_path / "upright.mp4", "-o", tmp_path / "poses.json", naming="give --camera FILE"
+    )
+
+
+def test_outputs_that_exist_or_are_the_input(refused, boulder, video, tmp_path):
+    taken, film = tmp_path / "taken.json", shutil.copy(video, tmp_path / "film.mp4")
+    taken.write_text("mine")
+    refused(boulder.map_path, film, "-o", taken, naming=taken)
+    taken = shutil.copy(taken, tmp_path / "taken.mp4")
+    refused(boulder.map_path, film, "-o", tmp_path / "poses.json", "--video", taken, naming=taken)
+    refused(
+        boulder.map_path, film, "-o", tmp_path / "poses.json", "--video", film, "--overwrite", naming=film
+    )

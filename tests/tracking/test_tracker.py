@@ -1,0 +1,173 @@
+import time
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from slimsfm.geometry import corner_error
+from slimsfm.localization import Localizer
+from slimsfm.tracking import Tracker, TrackerOptions
+
+BLACK = np.zeros((240, 320, 3), np.uint8)
+BUSY = TrackerOptions(renew_every=4, lag=3)
+
+
+def tracked(localizer, images, options=BUSY):
+    tracker = Tracker(localizer, options)
+    return [tracker.track(image) for image in images]
+
+
+def states(results):
+    return [one.state for one in results]
+
+
+def matrices(results):
+    return [one.pose and one.pose.cam_from_world.matrix().tolist() for one in results]
+
+
+def error(one, truth, box):
+    return corner_error(one.pose.cam_from_world, truth, box)
+
+
+@pytest.fixture(scope="module")
+def walked(localizer, walk):
+    """The sequence, tracked."""
+    return tracked(localizer, walk.images)
+
+
+def test_an_object_is_tracked_where_it_is_and_a_cut_is_seen_at_once(localizer, walk, walked):
+    half = len(walk.images) // 2
+    assert states(walked) == 2 * ["localized", *["tracked"] * (half - 1)]
+    errors = [error(one, t, localizer.map.box) for one, t in zip(walked, walk.cam_from_world, strict=True)]
+    assert max(errors) < 0.03
+
+
+def test_what_is_known_of_a_tracked_frame(walked):
+    for one in walked:
+        assert one.seconds > 0
+        assert 0 < one.pose.confidence <= 1
+        assert one.num_points == one.pose.num_inliers >= 10
+        localization = one.localization
+        assert len(localization.points2D) == len(localization.points3D_in_world) == len(one.pose.inliers)
+        assert localization.predicted_corner_error < 0.05
+
+
+def test_equal_frames_give_equal_poses_whatever_the_work_beside_takes(localizer, walk, walked, monkeypatch):
+    fast = localizer.localize_near
+    delays_s = iter([0.3, 0.0, 0.2, 0.05] * 10)
+    calls = []
+
+    def slow(*arguments):
+        calls.append(arguments)
+        time.sleep(next(delays_s))
+        return fast(*arguments)
+
+    monkeypatch.setattr(localizer, "localize_near", slow)
+    assert matrices(tracked(localizer, walk.images)) == matrices(walked)
+    assert len(calls) >= 4
+
+
+def test_a_still_video_stands_still(localizer, walk):
+    first, *others = tracked(localizer, 10 * walk.images[:1])
+    assert states(others) == 9 * ["tracked"]
+    for one in others:
+        assert error(one, first.pose.cam_from_world, localizer.map.box) < 0.003
+    assert error(others[1], others[0].pose.cam_from_world, localizer.map.box) < 1e-3
+
+
+def test_a_small_view_gives_the_poses_of_a_large_frame(localizer, walk):
+    large = [np.asarray(cv2.resize(image, (960, 720)), np.uint8) for image in walk.images[:4]]
+    results = tracked(localizer, large, TrackerOptions(max_image_size=320))
+    assert states(results) == ["localized", "tracked", "tracked", "tracked"]
+    for one, truth in zip(results, walk.cam_from_world, strict=False):
+        assert error(one, truth, localizer.map.box) < 0.03
+        errors_px = one.localization.points2D.max(axis=0)
+        assert np.all(errors_px > 320)  # in pixels of the frame
+
+
+def test_black_frames_have_no_pose_and_the_object_is_back_at_once(localizer, walk):
+    images = [*walk.images[:4], BLACK, BLACK, *walk.images[4:7]]
+    results = tracked(localizer, images)
+    assert states(results) == [
+        *("localized", "tracked", "tracked", "tracked"),
+        *("lost", "lost"),
+        *("localized", "tracked", "tracked"),
+    ]
+    assert [one.pose is None for one in results] == [image is BLACK for image in images]
+    assert results[4].num_points == 0
+
+
+def test_what_passes_in_front_does_not_take_the_pose_along(localizer, walk):
+    card = np.random.default_rng(0).integers(0, 256, (30, 20, 3), np.uint8)
+    card = np.asarray(cv2.resize(card, (160, 240), interpolation=cv2.INTER_CUBIC), np.uint8)
+    images = [walk.images[0].copy() for _ in range(24)]
+    for step, image in enumerate(images):
+        left = 320 - 16 * step
+        shown = slice(max(left, 0), max(left + 160, 0))
+        image[:, shown] = card[:, shown.start - left : 160][:, : max(320 - shown.start, 0)]
+    results = tracked(localizer, images)
+    errors = [error(one, walk.cam_from_world[0], localizer.map.box) for one in results if one.pose]
+    assert len(errors) > 12
+    assert max(errors) < 0.05
+    assert results[-1].pose
+
+
+def test_the_less_is_seen_the_less_sure_is_the_pose(localizer, walk):
+    covered = walk.images[0].copy()
+    covered[:, :165] = 90
+    whole, part = tracked(localizer, [walk.images[0], covered], TrackerOptions())
+    assert part.state == "tracked"
+    assert part.pose.confidence < whole.pose.confidence
+
+
+def test_smoothing_calms_what_is_given_out_and_not_the_tracking(localizer, walk):
+    noise = np.random.default_rng(0).normal(0, 6, (8, *walk.images[0].shape))
+    noisy = np.clip(walk.images[0] + noise, 0, 255).astype(np.uint8)
+    raw, calm = (tracked(localizer, noisy, TrackerOptions(smoothing=strength)) for strength in (0.0, 5.0))
+    trembling, calmed = (
+        [error(b, a.pose.cam_from_world, localizer.map.box) for a, b in pairwise(results)]
+        for results in (raw, calm)
+    )
+    assert np.mean(calmed) < np.mean(trembling)
+    assert [one.num_points for one in raw] == [one.num_points for one in calm]
+
+
+def test_a_frame_of_another_size_is_localized_anew(localizer, walk):
+    small = np.asarray(cv2.resize(walk.images[1], (300, 225), interpolation=cv2.INTER_AREA), np.uint8)
+    results = tracked(localizer, [walk.images[0], small])
+    assert states(results)[0] == "localized"
+    assert states(results)[1] in ("localized", "lost")
+
+
+def test_a_camera_of_another_size_is_refused(localizer):
+    other = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[600.0, 600.0, 320.0, 240.0])
+    with pytest.raises(ValueError, match="size 320x240"):
+        Tracker(localizer).track(BLACK, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_points", 0),
+        ("max_image_size", 63),
+        ("renew_every", 0),
+        ("lag", 0),
+        ("search_every", 0),
+        ("begin_confidence", 1.1),
+        ("smoothing", -1.0),
+        ("smoothing", float("nan")),
+    ],
+)
+def test_bad_options_are_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} must"):
+        TrackerOptions(**{name: value})
+
+
+def test_a_localizer_serves_several_trackers_at_a_time(boulder, walk):
+    localizer = Localizer(boulder.map)
+    one, other = Tracker(localizer, BUSY), Tracker(localizer, BUSY)
+    apart = [matrices(tracked(localizer, images)) for images in (walk.images[:6], walk.images[12:18])]
+    pairs = [(one.track(a), other.track(b)) for a, b in zip(walk.images[:6], walk.images[12:18], strict=True)]
+    assert [matrices(results) for results in zip(*pairs, strict=True)] == apart
