@@ -34,6 +34,7 @@ def localization(pose=None, extract=0.01, match=0.02, pose_seconds=0.005, confid
     inliers = np.ones(20, dtype=bool)
     return Localization(
         pose=pose and PoseEstimate(cam_from_world=pose, inliers=inliers, confidence=confidence),
+        camera=pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480),
         points2D=np.zeros((20, 2)),
         points3D_in_world=np.zeros((20, 3)),
         references=3,

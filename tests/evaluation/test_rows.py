@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 
 from slimsfm.evaluation.metrics import NO_POSE, PoseError, score
@@ -27,6 +28,7 @@ def row(corner_errors, *, metric=False, match=0.02, references=4.0, variant="ran
     seconds = Seconds(extract=0.01, match=match, pose=0.01)
     nothing = Localization(
         pose=None,
+        camera=pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480),
         points2D=np.zeros((0, 2)),
         points3D_in_world=np.zeros((0, 3)),
         references=4,

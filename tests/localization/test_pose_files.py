@@ -22,6 +22,7 @@ def results():
     return {
         name: Localization(
             pose=PoseEstimate(cam_from_world=TRUTH[name], inliers=inliers) if name in FOUND else None,
+            camera=pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480),
             points2D=np.zeros((20, 2)),
             points3D_in_world=np.zeros((20, 3)),
             references=3,

@@ -15,7 +15,7 @@ from scenes import BOX, camera, poses
 from slimsfm.features import Features, unit_rows
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
-from slimsfm.localization.direct import describe_points
+from slimsfm.localization.describing import describe_points
 from slimsfm.localization.strategy import MatchingOptions, Query, Strategy, unite
 from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.map import Map

@@ -21,8 +21,10 @@ from slimsfm.cli.output import (
 )
 from slimsfm.errors import InputError
 from slimsfm.execution import num_cores, on_threads
+from slimsfm.gravity import Gravity
 from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
-from slimsfm.localization.cameras import query_camera, read_camera
+from slimsfm.localization.cameras import FocalLength, query_camera, read_camera
+from slimsfm.localization.gravity_file import read_gravity
 from slimsfm.localization.pose_files import write_object_poses, write_poses, writer_for
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
@@ -41,6 +43,7 @@ def localize(
     also: tuple[Path, ...] = (),
     localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
     camera: Path | None = None,
+    gravity: Path | None = None,
     workers: int | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -53,6 +56,8 @@ def localize(
         also: Maps of further objects to seek in the same images; then poses go to .json or .csv.
         localization: How to localize.
         camera: Intrinsics of the images, in COLMAP's cameras.txt format; else the map's or EXIF's.
+        gravity: Where down is, as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame of the
+            map and those of the images' cameras.
         workers: Images to work on at a time; one a core if not given.
         overwrite: Replace what is there.
     """
@@ -63,9 +68,14 @@ def localize(
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")
     maps = {name: read_map(path) for name, path in _named(map, *also).items()}
-    queries = _queries(maps, images, read_camera(camera) if camera else None)
+    given = read_camera(camera) if camera else None
+    if gravity and (also or localization.focal != "known"):
+        raise InputError("gravity goes with one map and a known focal length; leave out also or focal")
+    queries = _queries(maps, images, given, localization.focal)
+    downwards = read_gravity(gravity) if gravity else {}
     localizers = {name: Localizer(one, localization) for name, one in maps.items()}
-    run = on_threads(partial(_localize, MultiLocalizer(localizers)), queries, workers or num_cores())
+    work = partial(_localize, MultiLocalizer(localizers), downwards)
+    run = on_threads(work, queries, workers or num_cores())
     label = f"localize ({', '.join(sorted({localization.strategy_for(one) for one in maps.values()}))})"
     results = {query.name: next(run) for query in shown(queries, label)}
     by_object = {name: {image: one[name] for image, one in results.items()} for name in maps}
@@ -94,20 +104,22 @@ def _named(*paths: Path) -> dict[str, Path]:
     return dict(zip(names, paths, strict=True))
 
 
-def _queries(maps: Mapping[str, Map], images: Path, given: pycolmap.Camera | None) -> list[_Query]:
+def _queries(
+    maps: Mapping[str, Map], images: Path, given: pycolmap.Camera | None, focal: FocalLength
+) -> list[_Query]:
     folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
     return [
         _Query(
             name=name,
             path=folder / name,
-            cameras={key: query_camera(one, folder / name, given) for key, one in maps.items()},
+            cameras={key: query_camera(one, folder / name, given, focal) for key, one in maps.items()},
         )
         for name in names
     ]
 
 
-def _localize(localizer: MultiLocalizer, query: _Query) -> Found:
-    return localizer.localize(read_image(query.path), query.cameras)
+def _localize(localizer: MultiLocalizer, downwards: Mapping[str, Gravity], query: _Query) -> Found:
+    return localizer.localize(read_image(query.path), query.cameras, downwards.get(query.name))
 
 
 def _print(results: Mapping[str, Found], *, several: bool) -> None:

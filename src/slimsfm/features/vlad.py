@@ -56,5 +56,4 @@ def vlad(descriptors: Descriptors, words: Float32[np.ndarray, "words d"]) -> Flo
     members = csr_array((np.ones(count, np.float32), order, starts), shape=(len(words), count))
     sums = members @ descriptors - np.diff(starts).astype(np.float32)[:, None] * words
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.float32(1e-6))
-    used = np.sqrt(np.float32(np.count_nonzero(np.diff(starts))))
-    return sums.ravel() / max(used, np.float32(1))
+    return sums.ravel() / max(np.linalg.norm(sums), np.float32(1e-6))

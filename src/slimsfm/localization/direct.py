@@ -9,12 +9,12 @@ References:
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Int64
+from jaxtyping import Int64
 
-from slimsfm.features import unit_rows
+from slimsfm.localization.describing import describe_points
 from slimsfm.localization.references import match_target
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
-from slimsfm.mapping.map import Map, PointDescriptors
+from slimsfm.mapping.map import Map
 
 _STRONGEST = (1024,)  # keypoints of the rounds before the last, which takes all
 _NARROWEST = 0.5  # cosine: a point may be seen from 60 degrees beside where it was seen from
@@ -53,34 +53,3 @@ class Direct:
         products = np.einsum("nd,nd->n", towards, self._described.directions)
         facing = np.flatnonzero(products >= least * lengths * np.linalg.norm(towards, axis=1))
         return self._described.descriptors[facing], self._described.points[facing]
-
-
-def describe_points(map: Map) -> PointDescriptors:
-    """All points, each with the mean, made of unit length, of the descriptors of its observations."""
-    points = np.arange(len(map.point3D_ids), dtype=np.int64)
-    return PointDescriptors(
-        points=points, descriptors=unit_rows(descriptor_sums(map)), directions=_directions(map)
-    )
-
-
-def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
-    """The sum of the unit descriptors of each point's observations."""
-    sums: np.ndarray | None = None
-    for name, seen in map.observations.items():
-        descriptors = unit_rows(map.features[name].descriptors[seen.rows])
-        if sums is None:
-            sums = np.zeros((len(map.point3D_ids), descriptors.shape[1]), np.float32)
-        np.add.at(sums, seen.points, descriptors)  # an image may see a point twice
-    return np.zeros((0, 0), np.float32) if sums is None else sums
-
-
-def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:
-    """Where each point was seen from: the mean unit vector towards the cameras that observe it."""
-    sums = np.zeros((len(map.point3D_ids), 3))
-    counts = np.zeros(len(sums))
-    for name, seen in map.observations.items():
-        towards = map.images[name].projection_center() - map.points3D_in_world[seen.points]
-        lengths = np.linalg.norm(towards, axis=1, keepdims=True)
-        np.add.at(sums, seen.points, towards / np.maximum(lengths, np.finfo(np.float64).tiny))
-        np.add.at(counts, seen.points, 1)
-    return (sums / np.maximum(counts, 1)[:, None]).astype(np.float32)

@@ -12,7 +12,8 @@ from jaxtyping import Shaped
 
 from slimsfm.arrays import Descriptors, Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
-from slimsfm.localization.cameras import scaled_camera
+from slimsfm.gravity import Gravity
+from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.guided import extract_near
 from slimsfm.localization.search import Attempt, Found, Search
 from slimsfm.localization.strategy import MatchingOptions, Query, Strategy
@@ -42,6 +43,10 @@ class LocalizationOptions:
 
     ransac: RansacOptions = RansacOptions()
     """The pose search."""
+
+    focal: FocalLength = "known"
+    """Whether the queries' focal length is known, known to 30 % (approximate), or unknown: then it is
+    estimated together with the pose."""
 
     min_confidence: float = 0.5
     """A pose less sure than this is not given out: the query counts as not localized."""
@@ -87,6 +92,9 @@ class Localization:
     pose: PoseEstimate | None
     """Where the camera stood, or None: the query could not be localized."""
 
+    camera: pycolmap.Camera
+    """The intrinsics; with the focal length that was found where it was not known."""
+
     points2D: Points2D
     """Pixels of the 2D-3D matches that the pose was sought in."""
 
@@ -118,15 +126,19 @@ class Localizer:
         self._memory = local()
         module, attribute = STRATEGIES[options.strategy_for(map)].split(":")
         strategy: Strategy = getattr(import_module(module), attribute)(map, options.matching)
-        self._search = Search(map, strategy, options.ransac)
+        self._search = Search(map, strategy, options.ransac, options.focal)
 
-    def localize(self, image: Image, camera: pycolmap.Camera | None = None) -> Localization:
+    def localize(
+        self, image: Image, camera: pycolmap.Camera | None = None, gravity: Gravity | None = None
+    ) -> Localization:
         """Localize one image.
 
         Args:
             image: Upright RGB.
             camera: Its intrinsics; those of the map where all reference images share a camera and the sizes
-                agree up to a common scale.
+                agree up to a common scale. Where the focal length is unknown, a guess will do.
+            gravity: Where down is in the map and in the image, as a phone tells; used where the focal length
+                is known.
 
         Raises:
             ValueError: No camera is given and the map's cannot stand in, or it is of another size.
@@ -134,7 +146,7 @@ class Localizer:
         camera = self.camera_of(image, camera)
         start = perf_counter()
         features = self._extractor.extract(image)
-        return self._localized(features, camera, perf_counter() - start)
+        return self._localized(features, camera, perf_counter() - start, gravity)
 
     def localize_near(
         self, image: Image, camera: pycolmap.Camera | None, near_cam_from_world: pycolmap.Rigid3d
@@ -162,17 +174,21 @@ class Localizer:
         seconds, query = perf_counter() - start, self._query(features)
         return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 
-    def localize_features(self, features: Features, camera: pycolmap.Camera) -> Localization:
+    def localize_features(
+        self, features: Features, camera: pycolmap.Camera, gravity: Gravity | None = None
+    ) -> Localization:
         """Localize an image by features that its map's extractor gave."""
-        return self._localized(features, camera, 0.0)
+        return self._localized(features, camera, 0.0, gravity)
 
     def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[Attempt]:
         """Everything that the strategy would try, round by round, without an early stop."""
         return self._search.attempts(self._query(features), camera)
 
-    def _localized(self, features: Features, camera: pycolmap.Camera, extract_seconds: float) -> Localization:
+    def _localized(
+        self, features: Features, camera: pycolmap.Camera, extract_seconds: float, gravity: Gravity | None
+    ) -> Localization:
         query = self._query(features)
-        return self._localization(query, self._search.run(query, camera), extract_seconds)
+        return self._localization(query, self._search.run(query, camera, gravity), extract_seconds)
 
     def _localization(self, query: Query, found: Found, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
@@ -180,6 +196,7 @@ class Localizer:
             pose = evidence = None
         return Localization(
             pose=pose,
+            camera=found.best.camera,
             points2D=query.keypoints[matches.keypoints],
             points3D_in_world=self.map.points3D_in_world[matches.points],
             references=found.references,
@@ -212,6 +229,8 @@ class Localizer:
         height, width = image.shape[:2]
         shared = self.map.shared_camera
         camera = given or (shared and scaled_camera(shared, width, height))
+        if camera is None and self._options.focal != "known":
+            camera = guess_camera(width, height)
         if camera is None:
             raise ValueError(
                 f"camera must be given: the map has no one camera for an image of {width}x{height} pixels"

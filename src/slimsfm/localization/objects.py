@@ -8,6 +8,7 @@ import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.features import Features, load_extractor
+from slimsfm.gravity import Gravity
 from slimsfm.localization.localizer import Localization, Localizer
 
 
@@ -25,13 +26,17 @@ class MultiLocalizer:
         self._localizers = dict(localizers)
 
     def localize(
-        self, image: Image, cameras: Mapping[str, pycolmap.Camera | None] | None = None
+        self,
+        image: Image,
+        cameras: Mapping[str, pycolmap.Camera | None] | None = None,
+        gravity: Gravity | None = None,
     ) -> dict[str, Localization]:
         """Seek every object in one image.
 
         Args:
             image: Upright RGB.
             cameras: Intrinsics by object; None, or none given, stands for the camera of the object's map.
+            gravity: As of `Localizer.localize`, in the frame that all maps share.
 
         Returns:
             A localization by object, in the order of the localizers; those with a pose are in the image. The
@@ -49,6 +54,6 @@ class MultiLocalizer:
             if key not in extracted:
                 extracted[key] = load_extractor(info.extractor, info.extractor_options).extract(image)
             seconds = perf_counter() - start
-            one = localizer.localize_features(extracted[key], camera)
+            one = localizer.localize_features(extracted[key], camera, gravity)
             found[name] = replace(one, seconds=replace(one.seconds, extract=seconds))
         return found

@@ -85,6 +85,7 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
             "confidence": one.pose and one.pose.confidence,
             "predicted_corner_error": one.predicted_corner_error,
             "covariance": one.pose and _covariance_to_json(one.pose),
+            "focal_length_px": one.camera.mean_focal_length(),
             "inliers": one.pose.num_inliers if one.pose else 0,
             "matches": one.num_matches,
             "references_tried": one.references,

@@ -10,7 +10,7 @@ import pycolmap
 from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import Ids, IndexPairs
-from slimsfm.localization.direct import describe_points
+from slimsfm.localization.describing import describe_points
 from slimsfm.localization.landmarks import choose_landmarks
 from slimsfm.localization.ranking import Ranking
 from slimsfm.localization.references import References, match_target, match_targets

@@ -3,10 +3,15 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import NamedTuple
 
 import pycolmap
 
+from slimsfm.focal import estimate_pose_and_focal
 from slimsfm.geometry import project
+from slimsfm.gravity import Gravity, estimate_upright_pose
+from slimsfm.localization.cameras import FocalLength
+from slimsfm.localization.describing import describe_points
 from slimsfm.localization.guided import match_near
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
@@ -15,6 +20,7 @@ from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 
 _SURE = 0.95  # confidence
 _EXACT = 0.006  # predicted relative corner error
+_APPROXIMATE = 0.3  # by which an approximate focal length may be off
 _SETTLED = 0.8  # of the error of the round before: more matches no longer help much
 
 
@@ -27,6 +33,9 @@ class Attempt:
 
     pose: PoseEstimate | None
     """The pose that they give, with its confidence."""
+
+    camera: pycolmap.Camera
+    """The intrinsics; with the focal length that was found where it was not known."""
 
     evidence: Evidence | None
     """What the confidence rests on; None where there is no pose."""
@@ -63,16 +72,19 @@ class Found:
 class Search:
     """Searches one map with one strategy."""
 
-    def __init__(self, map: Map, strategy: Strategy, ransac: RansacOptions) -> None:
+    def __init__(
+        self, map: Map, strategy: Strategy, ransac: RansacOptions, focal: FocalLength = "known"
+    ) -> None:
         self._map = map
         self._strategy = strategy
         self._ransac = ransac
-        self._verifier = Verifier(map, strategy)
+        self._focal: FocalLength = focal
+        self._verifier = Verifier(map, strategy, map.point_descriptors or describe_points(map))
 
-    def run(self, query: Query, camera: pycolmap.Camera) -> Found:
+    def run(self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None) -> Found:
         """Localize a query: try until it is enough."""
         attempts: list[Attempt] = []
-        for attempt in self.attempts(query, camera):
+        for attempt in self.attempts(query, camera, gravity):
             attempts.append(attempt)
             if _is_enough(attempts):
                 break
@@ -86,7 +98,9 @@ class Search:
         attempt = self._attempt(query, match_near(query, target, pixels, camera), camera, start)
         return _summed([attempt])
 
-    def attempts(self, query: Query, camera: pycolmap.Camera) -> Iterator[Attempt]:
+    def attempts(
+        self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None
+    ) -> Iterator[Attempt]:
         """Try everything, round by round."""
         rounds, pose = self._strategy.rounds(query), None
         while True:
@@ -95,30 +109,51 @@ class Search:
                 matches = rounds.send(pose)
             except StopIteration:
                 return
-            attempt = self._attempt(query, matches, camera, start)
+            attempt = self._attempt(query, matches, camera, start, gravity)
             pose = attempt.pose
             yield attempt
 
-    def _attempt(self, query: Query, matches: PointMatches, camera: pycolmap.Camera, start: float) -> Attempt:
+    def _attempt(
+        self,
+        query: Query,
+        matches: PointMatches,
+        camera: pycolmap.Camera,
+        start: float,
+        gravity: Gravity | None = None,
+    ) -> Attempt:
         matched = perf_counter()
-        pose, evidence = self._pose(query, matches, camera)
+        posed = self._estimate(query, matches, camera, gravity)
+        pose, evidence = posed.pose, None
+        if pose is not None:
+            evidence = self._verifier.evidence(query, matches, pose, posed.camera)
+            pose = replace(pose, confidence=evidence.confidence)
         return Attempt(
             matches=matches,
             pose=pose,
+            camera=posed.camera,
             evidence=evidence,
             match_seconds=matched - start,
             pose_seconds=perf_counter() - matched,
         )
 
-    def _pose(
-        self, query: Query, matches: PointMatches, camera: pycolmap.Camera
-    ) -> tuple[PoseEstimate | None, Evidence | None]:
-        points3D = self._map.points3D_in_world[matches.points]
-        pose = estimate_pose(query.keypoints[matches.keypoints], points3D, camera, self._ransac)
-        if pose is None:
-            return None, None
-        evidence = self._verifier.evidence(query, matches, pose, camera)
-        return replace(pose, confidence=evidence.confidence), evidence
+    def _estimate(
+        self, query: Query, matches: PointMatches, camera: pycolmap.Camera, gravity: Gravity | None
+    ) -> "_Posed":
+        points2D, points3D = query.keypoints[matches.keypoints], self._map.points3D_in_world[matches.points]
+        if self._focal == "known":
+            if gravity is None:
+                return _Posed(estimate_pose(points2D, points3D, camera, self._ransac), camera)
+            return _Posed(estimate_upright_pose(points2D, points3D, camera, gravity, self._ransac), camera)
+        uncertainty = _APPROXIMATE if self._focal == "approximate" else None
+        found = estimate_pose_and_focal(
+            points2D, points3D, camera, self._ransac, relative_uncertainty=uncertainty
+        )
+        return _Posed(found.pose, found.camera) if found else _Posed(None, camera)
+
+
+class _Posed(NamedTuple):
+    pose: PoseEstimate | None
+    camera: pycolmap.Camera
 
 
 def _is_enough(attempts: list[Attempt]) -> bool:

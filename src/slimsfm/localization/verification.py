@@ -1,14 +1,15 @@
 """Is a pose right? One number says so: the probability that its corner error is below 0.1 of the diagonal.
 
 Repeated texture, a twin of the object or a lucky few outliers give poses with many consistent inliers, so to
-count those is not enough. Five things are looked at, each of which a wrong pose finds hard to have:
+count those is not enough. Six things are looked at, each of which a wrong pose finds hard to have:
 
     inliers     how many keypoints agree with the pose
+    distinct    ... that could be nowhere else: their points look like no other point of the map
     share       ... of all that were matched
     precision   how exactly the inliers fix the pose, were they right: the predicted corner error
-    rival       how many keypoints agree with the best other pose among the matches that disagree with this
+    rival       how many keypoints agree with the best other pose, by the matches that disagree with this one
     found       which share of the points that should be visible has a keypoint that looks like it where it
-                projects, beyond the share that finds one at random places nearby
+                projects, and none elsewhere that does as well
 
 Their sum with fixed weights is the log-odds of being right: logistic regression on rendered and photographed
 scenes, some built to deceive, with weights held to the sign that reason demands. `benchmarks/confidence.py`
@@ -19,27 +20,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float64
-from scipy.spatial import KDTree
+from jaxtyping import Float64
 
-from slimsfm.arrays import Descriptors, Ids, Points2D
+from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
-from slimsfm.mapping.map import Map
+from slimsfm.mapping.map import Map, PointDescriptors
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 
 RIGHT = 0.1
 """Relative corner error below which a pose is right."""
 
-WEIGHTS = np.array([1.0, 2.0, 1.0, 0.7, 4.0, 6.0])
+WEIGHTS = np.array([3.3, 0.0, 0.95, 0.55, 0.55, 1.2, 1.0, 0.45])
 """Of the terms of `Evidence`, learned by `benchmarks/confidence.py`."""
 
 _RIVAL = RansacOptions(min_inliers=6, max_iterations=150)  # finds what a third of the rest agrees with
 _CHECKED = 150  # visible points that are looked for
-_RADIUS_PX = 5.0  # around where they project
-_SHIFTS_PX = 40.0 * np.array([(0.0, 0.0), (1.0, 0.0), (-0.5, 0.9), (-0.5, -0.9)])  # none, then by chance
-_LEAST_COSINE = np.float32(np.cos(0.7))  # of two descriptors that look alike
-_NEIGHBOURS = 4  # keypoints near a place that are compared
+_STRONGEST = 2048  # keypoints among which they are
+_NEAR_PX, _FAR_PX = 5.0, 15.0  # from where a point projects: it is there, it is elsewhere
+_ALIKE = 0.7  # radians between descriptors that look alike
+_MAX_RATIO = 0.9  # of the angle of the keypoint there to that of the best one elsewhere
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +48,9 @@ class Evidence:
 
     inliers: int
     """Keypoints that agree with it."""
+
+    distinct: int
+    """Those of them whose points look like no other point of the map."""
 
     matched: int
     """Keypoints that were matched."""
@@ -59,7 +62,7 @@ class Evidence:
     """Keypoints that agree with another pose, farther than a tenth of the diagonal, best of the rest."""
 
     found: float
-    """Share of the points that should be visible and are found, beyond chance; at most 1."""
+    """Share of the points that should be visible that are found where they should be and nowhere else."""
 
     @property
     def confidence(self) -> float:
@@ -72,10 +75,12 @@ class Evidence:
         return np.array(
             [
                 1.0,
-                np.log(self.inliers / 20),
-                np.log(self.inliers / self.matched),
-                -np.log(self.predicted_error / 0.01),
-                -self.rival / self.inliers,
+                np.log((self.inliers + 1) / 20),
+                np.log((self.distinct + 1) / 20),
+                np.log(max(self.inliers / self.matched, 0.02)),
+                -np.log(np.clip(self.predicted_error, 0.003, 0.3) / 0.01),
+                -np.log(max(self.rival, 6) / 6),
+                -min(self.rival / self.inliers, 1.0),
                 self.found,
             ]
         )
@@ -84,10 +89,13 @@ class Evidence:
 class Verifier:
     """Collects the evidence for poses in one map."""
 
-    def __init__(self, map: Map, strategy: Strategy) -> None:
+    def __init__(self, map: Map, strategy: Strategy, described: PointDescriptors) -> None:
         self._points3D_in_world = map.points3D_in_world
         self._box = map.box
         self._strategy = strategy
+        self._distinct = np.ones(len(map.point3D_ids), dtype=bool)
+        if described.distinct is not None:
+            self._distinct[described.points] = described.distinct
 
     def evidence(
         self, query: Query, matches: PointMatches, pose: PoseEstimate, camera: pycolmap.Camera
@@ -100,27 +108,29 @@ class Verifier:
             pose: The pose.
             camera: The query's intrinsics.
         """
-        agrees = np.zeros(len(query.keypoints), dtype=bool)
-        agrees[matches.keypoints[pose.inliers]] = True
-        rest = np.flatnonzero(~agrees[matches.keypoints])
-        num_agreeing, others = int(agrees.sum()), matches.keypoints[rest]
+        agreeing, points = matches.keypoints[pose.inliers], matches.points[pose.inliers]
+        others = ~pose.inliers
         return Evidence(
-            inliers=num_agreeing,
-            matched=num_agreeing + len(np.unique(others)),
+            inliers=_count(agreeing),
+            distinct=_count(agreeing[self._distinct[points]]),
+            matched=_count(matches.keypoints),
             predicted_error=pose.predicted_corner_error(self._box),
-            rival=self._rival(query.keypoints[others], matches.points[rest], pose, camera),
-            found=self._found(query, matches.points[pose.inliers], pose, camera),
+            rival=self._rival(query, matches.keypoints[others], matches.points[others], pose, camera),
+            found=self._found(query, points, pose, camera),
         )
 
-    def _rival(self, points2D: Points2D, points: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> int:
+    def _rival(
+        self, query: Query, keypoints: Ids, points: Ids, pose: PoseEstimate, camera: pycolmap.Camera
+    ) -> int:
         """How many keypoints agree with the best other pose."""
-        other = estimate_pose(points2D, self._points3D_in_world[points], camera, _RIVAL)
+        points3D = self._points3D_in_world[points]
+        other = estimate_pose(query.keypoints[keypoints], points3D, camera, _RIVAL)
         if other is None or corner_error(other.cam_from_world, pose.cam_from_world, self._box) < RIGHT:
             return 0
-        return len(np.unique(points2D[other.inliers], axis=0))
+        return _count(keypoints[other.inliers])
 
     def _found(self, query: Query, agreeing: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> float:
-        """Which share of what should be visible is found, beyond chance."""
+        """Which share of what should be visible is found, and found nowhere else."""
         descriptors, points = self._strategy.expected(pose.cam_from_world, agreeing)
         pixels = project(self._points3D_in_world[points], pose.cam_from_world, camera)
         inside = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=1)
@@ -128,21 +138,23 @@ class Verifier:
         if not len(visible):
             return 0.0
         visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
-        places = pixels[visible] + _SHIFTS_PX[:, None]
-        shares = _resembled(query, places, descriptors[visible]).mean(axis=1)
-        chance = float(shares[1:].mean())
-        return float(shares[0] - chance) / max(1 - chance, 0.1)
+        return float(_found_there_alone(query, pixels[visible], descriptors[visible]).mean())
 
 
-def _resembled(
-    query: Query, places: Float64[np.ndarray, "shifts n 2"], descriptors: Descriptors
-) -> Bool[np.ndarray, "shifts n"]:
-    """Which places have a keypoint near them that looks as it should."""
-    tree = KDTree(query.keypoints, balanced_tree=False, compact_nodes=False)
-    distances, rows = tree.query(places, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_PX)
-    shifts, points, columns = np.nonzero(np.isfinite(distances))
-    near = np.asarray(rows)[shifts, points, columns]
-    alike = np.einsum("nd,nd->n", query.descriptors[near], descriptors[points]) >= _LEAST_COSINE
-    found = np.zeros(places.shape[:2], dtype=bool)
-    found[shifts[alike], points[alike]] = True
-    return found
+def _count(keypoints: Ids) -> int:
+    """How many different keypoints there are: one may be matched with several points."""
+    return len(np.unique(keypoints))
+
+
+def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors) -> Mask:
+    """Which places have a keypoint near them that looks as it should, better than any far from them."""
+    keypoints = query.keypoints[:_STRONGEST].astype(np.float32)
+    if not len(keypoints):
+        return np.zeros(len(places), dtype=bool)
+    cosines = descriptors @ query.descriptors[:_STRONGEST].T
+    x, y = (places[:, axis, None].astype(np.float32) - keypoints[None, :, axis] for axis in (0, 1))
+    squares = x * x + y * y
+    near = np.where(squares < _NEAR_PX**2, cosines, -1).max(axis=1)
+    far = np.where(squares > _FAR_PX**2, cosines, -1).max(axis=1)
+    angles, others = (np.arccos(np.clip(best, -1, 1)) for best in (near, far))
+    return (angles <= _ALIKE) & (angles <= _MAX_RATIO * others)

@@ -10,7 +10,7 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 from scipy.sparse import csr_array
 
-from slimsfm.arrays import Descriptors, Ids, IndexPairs, Points3D
+from slimsfm.arrays import Descriptors, Ids, IndexPairs, Mask, Points3D
 from slimsfm.errors import MapError
 from slimsfm.features import Features
 from slimsfm.geometry import Box
@@ -64,11 +64,17 @@ class PointDescriptors:
     """For each of them where it was seen from: the mean of the unit vectors towards the cameras that observe
     it, the shorter the more these differ; None in maps of old, which tell nothing of it."""
 
+    distinct: Mask | None = None
+    """Which of them look like no other point of the full map; the others prove little of a pose. None in maps
+    of old."""
+
     def __getitem__(self, rows: Ids) -> "PointDescriptors":
         """Some of them, in this order."""
-        directions = None if self.directions is None else self.directions[rows]
         return PointDescriptors(
-            points=self.points[rows], descriptors=self.descriptors[rows], directions=directions
+            points=self.points[rows],
+            descriptors=self.descriptors[rows],
+            directions=None if self.directions is None else self.directions[rows],
+            distinct=None if self.distinct is None else self.distinct[rows],
         )
 
 

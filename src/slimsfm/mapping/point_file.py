@@ -16,7 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from slimsfm.arrays import Descriptors
+from slimsfm.arrays import Descriptors, Mask
 from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
 from slimsfm.mapping.map import PointDescriptors
@@ -97,6 +97,8 @@ def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
     arrays["points"] = np.frombuffer(lzma.compress(steps.tobytes()), np.uint8)
     if points.directions is not None:
         arrays["directions"] = np.round(_INT8_MAX * points.directions).astype(np.int8)
+    if points.distinct is not None:
+        arrays["distinct"] = np.packbits(points.distinct)
     with path.open("wb") as file:
         np.savez(file, **arrays)
 
@@ -113,9 +115,11 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
             points = np.cumsum(steps, dtype=np.int64) - 1
             if not len(points) or points[-1] >= num_points or not steps.all():
                 raise ValueError(f"its rows are not those of {num_points} points")
-            directions = _unpack_directions(file, len(points)) if "directions" in file else None
             return PointDescriptors(
-                points=points, descriptors=unpack(file, len(points)), directions=directions
+                points=points,
+                descriptors=unpack(file, len(points)),
+                directions=_unpack_directions(file, len(points)) if "directions" in file else None,
+                distinct=_unpack_bits(file["distinct"], len(points)) if "distinct" in file else None,
             )
     except UNREADABLE as error:
         raise InputError(f"{path}: damaged ({error}); make the map again with `slimsfm reduce`") from error
@@ -123,3 +127,9 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
 
 def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[np.ndarray, "n 3"]:
     return arrays["directions"].reshape(count, 3).astype(np.float32) / _INT8_MAX
+
+
+def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
+    if len(packed) != (count + 7) // 8:
+        raise ValueError(f"{len(packed)} bytes do not hold a bit of each of {count} points")
+    return np.unpackbits(packed, count=count).astype(bool)

@@ -7,7 +7,7 @@ import numpy as np
 
 from slimsfm.arrays import Ids
 from slimsfm.geometry import ADD_FRACTIONS
-from slimsfm.localization.direct import describe_points
+from slimsfm.localization.describing import describe_points
 from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import Map, PointDescriptors
 from slimsfm.mapping.subset import keep_images

@@ -1,0 +1,67 @@
+"""What is known of each point of a map beside its position."""
+
+import numpy as np
+from jaxtyping import Float32
+
+from slimsfm.arrays import Descriptors, Mask
+from slimsfm.features import unit_rows
+from slimsfm.features.vlad import learn_words, nearest_word
+from slimsfm.mapping.map import Map, PointDescriptors
+
+_ALIKE = np.float32(np.cos(0.35))  # of the descriptors of look-alikes
+_FAR = 0.1  # of the diagonal: to take a point for one that is nearer hardly harms a pose
+
+
+def describe_points(map: Map) -> PointDescriptors:
+    """All points, each with the mean, made of unit length, of the descriptors of its observations."""
+    points = np.arange(len(map.point3D_ids), dtype=np.int64)
+    descriptors = unit_rows(descriptor_sums(map))
+    return PointDescriptors(
+        points=points,
+        descriptors=descriptors,
+        directions=_directions(map),
+        distinct=_distinct(map, descriptors),
+    )
+
+
+def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
+    """The sum of the unit descriptors of each point's observations."""
+    sums: np.ndarray | None = None
+    for name, seen in map.observations.items():
+        descriptors = unit_rows(map.features[name].descriptors[seen.rows])
+        if sums is None:
+            sums = np.zeros((len(map.point3D_ids), descriptors.shape[1]), np.float32)
+        np.add.at(sums, seen.points, descriptors)  # an image may see a point twice
+    return np.zeros((0, 0), np.float32) if sums is None else sums
+
+
+def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:
+    """Where each point was seen from: the mean unit vector towards the cameras that observe it."""
+    sums = np.zeros((len(map.point3D_ids), 3))
+    counts = np.zeros(len(sums))
+    for name, seen in map.observations.items():
+        towards = map.images[name].projection_center() - map.points3D_in_world[seen.points]
+        lengths = np.linalg.norm(towards, axis=1, keepdims=True)
+        np.add.at(sums, seen.points, towards / np.maximum(lengths, np.finfo(np.float64).tiny))
+        np.add.at(counts, seen.points, 1)
+    return (sums / np.maximum(counts, 1)[:, None]).astype(np.float32)
+
+
+def _distinct(map: Map, descriptors: Descriptors) -> Mask:
+    """Which points look like no other point of the map that is not near them.
+
+    Points are compared with those of the same word, which look-alikes mostly share. O(points^2 / words).
+    """
+    points, far = map.points3D_in_world, _FAR * map.box.diagonal
+    if not len(points):
+        return np.zeros(0, dtype=bool)
+    words = map.appearance.words if map.appearance else learn_words(descriptors)
+    word_of = nearest_word(descriptors, words)
+    distinct = np.ones(len(points), dtype=bool)
+    for word in range(len(words)):
+        members = np.flatnonzero(word_of == word)
+        alike = descriptors[members] @ descriptors[members].T > _ALIKE
+        rows, columns = (members[side] for side in np.nonzero(np.triu(alike, k=1)))
+        apart = np.linalg.norm(points[rows] - points[columns], axis=1) > far
+        distinct[rows[apart]] = distinct[columns[apart]] = False
+    return distinct

@@ -1,0 +1,140 @@
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from scenes import camera, exact_map, poses
+from slimsfm.features import Features
+from slimsfm.geometry import project
+from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.localization.describing import describe_points
+from slimsfm.localization.landmarks import choose_landmarks
+from slimsfm.localization.verification import WEIGHTS, Evidence
+from slimsfm.mapping.map import observed
+
+GOOD = Evidence(inliers=80, distinct=60, matched=100, predicted_error=0.004, rival=0, found=0.6)
+WORSE = {
+    "inliers": [70, 40, 15],
+    "distinct": [40, 10, 0],
+    "matched": [120, 300, 2000],
+    "predicted_error": [0.01, 0.05, 2.0],
+    "rival": [10, 40, 80],
+    "found": [0.4, 0.1, -0.1],
+}
+
+
+@pytest.mark.parametrize("name", WORSE)
+def test_confidence_never_rises_as_evidence_gets_worse(name):
+    values = [replace(GOOD, **{name: value}).confidence for value in WORSE[name]]
+    assert [GOOD.confidence, *values] == sorted([GOOD.confidence, *values], reverse=True)
+    assert all(0 < value < 1 for value in values)
+
+
+def test_weights_fit_the_terms_and_have_the_sign_that_reason_demands():
+    assert WEIGHTS.shape == GOOD.terms.shape
+    assert np.all(WEIGHTS[1:] >= 0)
+
+
+def found_with(evidence_of, query, lens, strategy="exhaustive"):
+    options = LocalizationOptions(strategy=strategy, min_confidence=0.0)
+    (*_, attempt) = Localizer(evidence_of, options).attempts(query, lens)
+    return attempt
+
+
+def test_an_exact_view_has_all_the_evidence(exact):
+    attempt = found_with(exact, exact.features["001.png"], camera())
+    evidence = attempt.evidence
+    assert evidence.inliers == evidence.matched == len(exact.observations["001.png"].rows)
+    assert evidence.rival == 0
+    assert evidence.found > 0.9
+    assert attempt.pose.confidence == evidence.confidence > 0.9
+
+
+def seen_from(map_, cam_from_world, part=slice(None)):
+    """Keypoints of a part of the points of an exact map, as a camera there sees them."""
+    name, seen = next(iter(map_.observations.items()))
+    descriptors = np.empty((len(map_.point3D_ids), 32), np.float32)
+    descriptors[seen.points] = map_.features[name].descriptors[seen.rows]
+    return project(map_.points3D_in_world[part], cam_from_world, camera()), descriptors[part]
+
+
+def features(parts):
+    keypoints = np.concatenate([one[0] for one in parts]).astype(np.float32)
+    return Features(
+        keypoints=keypoints,
+        descriptors=np.concatenate([one[1] for one in parts]),
+        scores=np.ones(len(keypoints), np.float32),
+        image_size=(640, 480),
+    )
+
+
+def test_a_second_pose_that_explains_the_rest_is_a_rival(exact):
+    here, there = poses(11)[3], poses(7)[5]
+    query = features([seen_from(exact, here, slice(0, 70)), seen_from(exact, there, slice(70, None))])
+    evidence = found_with(exact, query, camera()).evidence
+    assert (evidence.inliers, evidence.rival) == (70, 50)
+    alone = found_with(exact, features([seen_from(exact, here, slice(0, 70))]), camera()).evidence
+    assert (alone.inliers, alone.rival) == (70, 0)
+    assert evidence.confidence < alone.confidence
+
+
+def test_points_that_should_be_visible_and_are_not_lower_what_is_found(exact):
+    few = features([seen_from(exact, poses(11)[3], slice(0, 30))])
+    assert found_with(exact, few, camera()).evidence.found == pytest.approx(30 / 120, abs=0.05)
+
+
+def test_points_with_a_look_alike_far_away_are_not_distinct():
+    plain = exact_map(num_points=60)
+    assert describe_points(plain).distinct.all()
+    doubled = {}
+    for name, one in plain.features.items():
+        seen, descriptors = plain.observations[name], one.descriptors.copy()
+        by_point = dict(zip(seen.points.tolist(), seen.rows.tolist(), strict=True))
+        for point in range(10):
+            descriptors[by_point[point + 10]] = descriptors[by_point[point]]
+        doubled[name] = replace(one, descriptors=descriptors)
+    described = describe_points(replace(plain, features=doubled))
+    apart = np.linalg.norm(plain.points3D_in_world[:10] - plain.points3D_in_world[10:20], axis=1)
+    far = apart > 0.1 * plain.box.diagonal
+    assert far.sum() > 5
+    assert np.array_equal(described.distinct, ~np.concatenate([far, far, np.zeros(40, bool)]))
+
+
+def test_landmarks_are_seen_by_every_image():
+    map_ = exact_map(num_images=12, num_points=900, reach_deg=60.0)
+    landmarks = choose_landmarks(map_)
+    assert np.all(np.diff(landmarks) > 0)
+    assert len(landmarks) < len(map_.point3D_ids) / 2
+    counts = observed(map_)[:, landmarks].sum(axis=1)
+    assert counts.min() >= 60
+
+
+def test_an_unsure_pose_is_not_given_out(exact):
+    query, lens = features([seen_from(exact, poses(11)[3])]), camera()
+    sure = Localizer(exact).localize_features(query, lens)
+    bar = LocalizationOptions(min_confidence=1.0)
+    unsure = Localizer(exact, bar).localize_features(query, lens)
+    assert sure.pose is not None
+    assert sure.predicted_corner_error is not None
+    assert unsure.pose is None
+    assert unsure.predicted_corner_error is None
+    assert unsure.num_matches == sure.num_matches
+    with pytest.raises(ValueError, match="min_confidence must be between 0 and 1, got 2.0"):
+        LocalizationOptions(min_confidence=2.0)
+
+
+def test_an_unknown_focal_length_is_found(exact):
+    lens = camera_of(560.0)
+    guess = camera_of(700.0)
+    pixels = project(exact.points3D_in_world, poses(11)[3], lens)
+    query = features([(pixels, seen_from(exact, poses(11)[3])[1])])
+    for focal in ("approximate", "unknown"):
+        options = LocalizationOptions(focal=focal)
+        found = Localizer(exact, options).localize_features(query, guess)
+        assert found.pose is not None
+        assert found.camera.mean_focal_length() == pytest.approx(560, rel=1e-3)
+
+
+def camera_of(focal_px):
+    return pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[focal_px, 320.0, 240.0])

@@ -1,0 +1,68 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes import exact_map
+from slimsfm.errors import MapError
+from slimsfm.localization.describing import describe_points
+from slimsfm.mapping.appearance import describe_images, with_appearance
+from slimsfm.mapping.direct import direct_map
+from slimsfm.mapping.io import bytes_by_part, read_map, write_map
+from slimsfm.mapping.subset import keep_images
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """Twelve images, each of which sees a part of the points."""
+    return with_appearance(exact_map(num_images=12, num_points=400, reach_deg=60.0))
+
+
+def test_an_image_resembles_itself_most_and_its_neighbours_more_than_others(narrow):
+    cosines = narrow.appearance.rows @ narrow.appearance.rows.T
+    assert np.allclose(np.diag(cosines), 1, atol=1e-4)
+    opposite = np.roll(cosines, 6, axis=1).diagonal()
+    assert np.all(np.roll(cosines, 1, axis=1).diagonal() > opposite)
+
+
+def test_what_sees_no_point_of_the_map_does_not_count(narrow):
+    features = {}
+    for name, one in narrow.features.items():
+        seen = np.zeros(len(one), bool)
+        seen[narrow.observations[name].rows] = True
+        features[name] = replace(one, descriptors=np.where(seen[:, None], one.descriptors, 0.5))
+    assert np.array_equal(describe_images(replace(narrow, features=features)).rows, narrow.appearance.rows)
+
+
+def test_it_is_read_back_but_for_rounding(narrow, tmp_path):
+    write_map(narrow, tmp_path / "map")
+    read = read_map(tmp_path / "map").appearance
+    assert np.array_equal(read.words, narrow.appearance.words)
+    assert np.all(np.sum(read.rows * narrow.appearance.rows, axis=1) > 0.94)
+    assert bytes_by_part(tmp_path / "map")["global.npz"] > 0
+
+
+def test_it_stays_with_the_images_that_stay(narrow):
+    names = list(narrow.images)[2:9:3]
+    slim = keep_images(narrow, names)
+    rows = [list(narrow.images).index(name) for name in names]
+    assert np.array_equal(slim.appearance.rows, narrow.appearance.rows[rows])
+    assert direct_map(narrow, describe_points(narrow)).appearance is None
+
+
+def test_a_map_without_it_is_read(narrow, tmp_path):
+    write_map(replace(narrow, appearance=None), tmp_path / "map")
+    assert not (tmp_path / "map" / "global.npz").exists()
+    assert read_map(tmp_path / "map").appearance is None
+
+
+def test_a_damaged_or_foreign_file_is_named(narrow, tmp_path):
+    write_map(narrow, tmp_path / "map")
+    path = tmp_path / "map" / "global.npz"
+    whole = path.read_bytes()
+    other = keep_images(narrow, list(narrow.images)[:3])
+    write_map(other, tmp_path / "other")
+    for content in (whole[: len(whole) // 2], b"", b"nonsense", (tmp_path / "other/global.npz").read_bytes()):
+        path.write_bytes(content)
+        with pytest.raises(MapError, match=r"global\.npz: damaged"):
+            read_map(tmp_path / "map")
