@@ -2,8 +2,8 @@
 
     python benchmarks/confidence.py PHOTOS [PHOTOS ...] -o /tmp/scenes
 
-Every strategy localizes every query of every scene, with all of its keypoints and with a random few, and so do
-queries of another scene, whose poses are all wrong. Each round of each strategy gives one example. Weights
+Every strategy localizes every query of every scene, with all of its keypoints and with a random few, and so
+do queries of another scene, whose poses are all wrong. Each round of each strategy gives one example. Weights
 shown last are learned from all scenes; the reliability is that of weights learned from all scenes but the
 one that is shown, every scene in turn.
 """
@@ -11,6 +11,7 @@ one that is shown, every scene in turn.
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,9 @@ def main() -> None:
     for scene, other in zip(known, [*known[1:], known[0]], strict=True):
         found = list(examples_of(scene, other))
         examples += found
-        print(f"{scene.name}: {len(found)} poses, {np.mean([one.right for one in found]):.0%} right", flush=True)
+        print(
+            f"{scene.name}: {len(found)} poses, {np.mean([one.right for one in found]):.0%} right", flush=True
+        )
     np.savez(
         arguments.output / "confidence.npz",
         terms=[one.terms for one in examples],
@@ -139,11 +142,12 @@ def report(examples: list[Example]) -> None:
         probabilities[here] = 1 / (1 + np.exp(-np.clip(terms[here] @ weights, -50, 50)))
         sure = here & (probabilities > 0.9)
         print(
-            f"{name:16} over 0.9: {sure.sum():5d} of {here.sum():5d}, wrong {100 * np.mean(~right[sure]):5.2f} %"
-            f"; right below 0.5: {100 * np.mean(probabilities[here & right] < 0.5):.1f} %"
+            f"{name:16} over 0.9: {sure.sum():5d} of {here.sum():5d}, "
+            f"wrong {100 * np.mean(~right[sure]):5.2f} %; "
+            f"right below 0.5: {100 * np.mean(probabilities[here & right] < 0.5):.1f} %"
         )
     print("confidence   poses   mean   right")
-    for low, high in zip(EDGES, EDGES[1:], strict=False):
+    for low, high in pairwise(EDGES):
         rows = (probabilities >= low) & (probabilities <= high if high == 1 else probabilities < high)
         if rows.any():
             print(

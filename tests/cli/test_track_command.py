@@ -224,6 +224,7 @@ def test_bad_maps_outputs_and_options(refused, boulder, video, tmp_path):
     refused(boulder.map_path, video, naming="see slimsfm track --help")
     for option, value, naming in (
         ("--smoothing", -1, "smoothing must not be negative, got -1.0"),
+        ("--focal", "unknown", "give --camera FILE"),
         ("--lag", 0, "lag must be at least 1, got 0"),
         ("--camera", tmp_path / "missing.txt", "missing.txt"),
     ):

@@ -56,8 +56,8 @@ def localize(
         also: Maps of further objects to seek in the same images; then poses go to .json or .csv.
         localization: How to localize.
         camera: Intrinsics of the images, in COLMAP's cameras.txt format; else the map's or EXIF's.
-        gravity: Where down is, as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame of the
-            map and those of the images' cameras.
+        gravity: Where down is, as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame of
+            the map and those of the images' cameras.
         workers: Images to work on at a time; one a core if not given.
         overwrite: Replace what is there.
     """

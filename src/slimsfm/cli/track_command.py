@@ -55,6 +55,8 @@ def track(
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
+    if localization.focal != "known":
+        raise InputError("tracking needs a known focal length; leave out --focal and give --camera FILE")
     for path in (output, video) if video else (output,):
         for made_of in (map, Path(source)):
             check_output(path, made_of, overwrite=overwrite)

@@ -54,10 +54,10 @@ class Attempt:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Found:
-    """The surest attempt, and what all of them took."""
+    """The attempt that counts, and what all of them took."""
 
     best: Attempt
-    """The attempt of greatest confidence; of equal ones the last."""
+    """The last that gave a pose: it knows all that those before knew, and what speaks against them."""
 
     references: int
     """Reference images that the query was matched with."""
@@ -168,7 +168,7 @@ def _is_enough(attempts: list[Attempt]) -> bool:
 
 def _summed(attempts: list[Attempt]) -> Found:
     return Found(
-        best=max(reversed(attempts), key=lambda one: one.confidence),
+        best=next((one for one in reversed(attempts) if one.pose), attempts[-1]),
         references=max(one.matches.references for one in attempts),
         match_seconds=sum(one.match_seconds for one in attempts),
         pose_seconds=sum(one.pose_seconds for one in attempts),

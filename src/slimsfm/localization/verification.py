@@ -1,11 +1,10 @@
 """Is a pose right? One number says so: the probability that its corner error is below 0.1 of the diagonal.
 
 Repeated texture, a twin of the object or a lucky few outliers give poses with many consistent inliers, so to
-count those is not enough. Six things are looked at, each of which a wrong pose finds hard to have:
+count those is not enough. Five things are looked at, each of which a wrong pose finds hard to have:
 
-    inliers     how many keypoints agree with the pose
-    distinct    ... that could be nowhere else: their points look like no other point of the map
-    share       ... of all that were matched
+    distinct    how many keypoints agree with the pose whose points look like no other point of the map
+    share       how many of the matched keypoints agree with it
     precision   how exactly the inliers fix the pose, were they right: the predicted corner error
     rival       how many keypoints agree with the best other pose, by the matches that disagree with this one
     found       which share of the points that should be visible has a keypoint that looks like it where it
@@ -31,11 +30,11 @@ from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 RIGHT = 0.1
 """Relative corner error below which a pose is right."""
 
-WEIGHTS = np.array([3.3, 0.0, 0.95, 0.55, 0.55, 1.2, 1.0, 0.45])
+WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
 """Of the terms of `Evidence`, learned by `benchmarks/confidence.py`."""
 
 _RIVAL = RansacOptions(min_inliers=6, max_iterations=150)  # finds what a third of the rest agrees with
-_CHECKED = 150  # visible points that are looked for
+_CHECKED = 100  # visible points that are looked for
 _STRONGEST = 2048  # keypoints among which they are
 _NEAR_PX, _FAR_PX = 5.0, 15.0  # from where a point projects: it is there, it is elsewhere
 _ALIKE = 0.7  # radians between descriptors that look alike
@@ -75,7 +74,6 @@ class Evidence:
         return np.array(
             [
                 1.0,
-                np.log((self.inliers + 1) / 20),
                 np.log((self.distinct + 1) / 20),
                 np.log(max(self.inliers / self.matched, 0.02)),
                 -np.log(np.clip(self.predicted_error, 0.003, 0.3) / 0.01),
@@ -148,13 +146,15 @@ def _count(keypoints: Ids) -> int:
 
 def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors) -> Mask:
     """Which places have a keypoint near them that looks as it should, better than any far from them."""
-    keypoints = query.keypoints[:_STRONGEST].astype(np.float32)
+    keypoints = query.keypoints[:_STRONGEST]
     if not len(keypoints):
         return np.zeros(len(places), dtype=bool)
     cosines = descriptors @ query.descriptors[:_STRONGEST].T
-    x, y = (places[:, axis, None].astype(np.float32) - keypoints[None, :, axis] for axis in (0, 1))
-    squares = x * x + y * y
-    near = np.where(squares < _NEAR_PX**2, cosines, -1).max(axis=1)
-    far = np.where(squares > _FAR_PX**2, cosines, -1).max(axis=1)
-    angles, others = (np.arccos(np.clip(best, -1, 1)) for best in (near, far))
-    return (angles <= _ALIKE) & (angles <= _MAX_RATIO * others)
+    best = cosines.argmax(axis=1)
+    angles = np.arccos(np.clip(cosines[np.arange(len(places)), best], -1, 1))
+    found = (np.linalg.norm(places - keypoints[best], axis=1) < _NEAR_PX) & (angles <= _ALIKE)
+    rows = np.flatnonzero(found)
+    which, others = np.nonzero(cosines[rows] > np.cos(angles[rows] / _MAX_RATIO)[:, None])
+    apart = np.linalg.norm(places[rows[which]] - keypoints[others], axis=1) > _FAR_PX
+    found[rows[which[apart]]] = False
+    return found
