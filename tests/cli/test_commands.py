@@ -107,7 +107,7 @@ def test_reduce_to_named_and_to_random_images(boulder, tmp_path):
     assert len(read_map(tmp_path / "drawn").images) == 5
 
 
-@pytest.mark.parametrize("strategy", ["exhaustive", "direct"])
+@pytest.mark.parametrize("strategy", ["exhaustive", "direct", "progressive", "retrieval"])
 def test_localize_references_in_full_and_slim_map(boulder, tmp_path, strategy):
     slim = tmp_path / "slim"
     assert slimsfm("reduce", boulder.map_path, "-o", slim, "--edges", "localize").code == 0
@@ -136,6 +136,71 @@ def test_localize_one_image_with_its_camera(boulder, tmp_path):
     assert_done(done, output, "info")
     assert "1 of 1 images localized" in done.out
     assert len(output.read_text().splitlines()) == 2
+
+
+def test_any_number_of_workers_gives_the_same_poses(boulder, tmp_path):
+    found = []
+    for workers in (1, 3):
+        output = tmp_path / f"{workers}.tum"
+        slimsfm("localize", boulder.map_path, boulder.queries, "-o", output, "--workers", workers)
+        found.append(output.read_bytes())
+    assert found[0] == found[1]
+    assert found[0]
+
+
+def test_several_objects_are_sought_at_once(boulder, tmp_path):
+    twin = shutil.copytree(boulder.map_path, tmp_path / "twin")
+    output = tmp_path / "poses.json"
+    done = slimsfm("localize", boulder.map_path, boulder.queries, "-o", output, "--also", twin)
+    assert_done(done, output, "info")
+    rows = json.loads(output.read_text())["images"]
+    assert [row["object"] for row in rows] == ["map", "twin"] * QUERY_FRAMES
+    for one, other in zip(rows[::2], rows[1::2], strict=True):
+        assert one["name"] == other["name"]
+        assert one["cam_from_world"] == other["cam_from_world"]
+        assert one["ms_extract"] > 10 * other["ms_extract"]
+    refused = slimsfm("localize", boulder.map_path, boulder.queries, "-o", tmp_path / "a.txt", "--also", twin)
+    assert refused.code == 2
+    assert "several objects are written as .json or .csv" in refused.err
+
+
+def test_a_pose_says_how_sure_and_exact_it_is(boulder, tmp_path):
+    slimsfm("localize", boulder.map_path, boulder.queries, "-o", tmp_path / "poses.json")
+    rows = json.loads((tmp_path / "poses.json").read_text())["images"]
+    localized = [row for row in rows if row["localized"]]
+    assert localized
+    for row in localized:
+        assert 0.5 <= row["confidence"] <= 1
+        assert 0 < row["predicted_corner_error"] < 0.1
+        assert np.array(row["covariance"]).shape == (6, 6)
+        assert row["focal_length_px"] == pytest.approx(boulder.map.shared_camera.mean_focal_length())
+
+
+def test_an_unknown_focal_length_is_estimated(boulder, tmp_path):
+    output = tmp_path / "poses.json"
+    camera = tmp_path / "camera.txt"
+    camera.write_text("1 SIMPLE_PINHOLE 320 240 400 160 120\n")
+    arguments = ("--camera", camera, "--focal", "unknown")
+    slimsfm("localize", boulder.map_path, boulder.mapping.image_paths[12], "-o", output, *arguments)
+    (row,) = json.loads(output.read_text())["images"]
+    assert row["focal_length_px"] == pytest.approx(boulder.map.shared_camera.mean_focal_length(), rel=0.03)
+
+
+def test_gravity_is_read_and_must_fit(boulder, tmp_path):
+    path = boulder.mapping.image_paths[12]
+    down = boulder.map.images[path.name].cam_from_world().rotation.matrix() @ [0.0, 0.0, -1.0]
+    gravity = tmp_path / "gravity.json"
+    for in_cam, localized in ((down, True), (-down, False)):
+        gravity.write_text(json.dumps({"world": [0, 0, -1], "images": {path.name: in_cam.tolist()}}))
+        output = tmp_path / f"{localized}.json"
+        slimsfm("localize", boulder.map_path, path, "-o", output, "--gravity", gravity)
+        (row,) = json.loads(output.read_text())["images"]
+        assert row["localized"] is localized
+    gravity.write_text("{}")
+    refused = slimsfm("localize", boulder.map_path, path, "-o", tmp_path / "x.json", "--gravity", gravity)
+    assert refused.code == 2
+    assert "gravity.json: should hold" in refused.err
+    assert not (tmp_path / "x.json").exists()
 
 
 def test_what_shows_nothing_of_the_object_is_not_localized(boulder, tmp_path):

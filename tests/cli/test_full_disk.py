@@ -80,7 +80,7 @@ def test_a_graph_is_whole_or_not_there(boulder, tmp_path):
         assert str(a_map / "graph-matches.partial") in line
         assert not (tmp_path / "slim").exists()
         names = {path.name for path in a_map.iterdir()}
-        assert names == {"sparse", "features.h5", "matches.h5", "map.json"}
+        assert names == {"sparse", "features.h5", "matches.h5", "global.npz", "map.json"}
 
 
 def _fill(file):

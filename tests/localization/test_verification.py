@@ -120,7 +120,7 @@ def test_an_unsure_pose_is_not_given_out(exact):
     assert unsure.pose is None
     assert unsure.predicted_corner_error is None
     assert unsure.num_matches == sure.num_matches
-    with pytest.raises(ValueError, match="min_confidence must be between 0 and 1, got 2.0"):
+    with pytest.raises(ValueError, match=r"min_confidence must be between 0 and 1, got 2\.0"):
         LocalizationOptions(min_confidence=2.0)
 
 

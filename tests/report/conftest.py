@@ -68,6 +68,8 @@ def make_row():
             add={0.1: add, 0.05: 90.0, 0.02: 70.0},
             median_corner_error=median,
             deg_cm=deg_cm,
+            confidence_wrong=0.02,
+            references_tried=3.0,
             seconds=Seconds(extract=0.03, match=match, pose=0.004),
         )
         sizes = {"references": 4.0, "points": 30.0, "map_bytes": 2.4e7, **sizes}

@@ -6,9 +6,9 @@ import pytest
 from scenes import exact_map
 from slimsfm.features import unit_rows
 from slimsfm.localization.describing import describe_points
+from slimsfm.mapping.map import observed
 from slimsfm.mapping.subset import keep_images
 from slimsfm.selection.left_out import LeftOut
-from slimsfm.mapping.map import observed
 from slimsfm.selection.views import selection_problem
 
 
