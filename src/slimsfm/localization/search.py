@@ -19,6 +19,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 
 _SURE = 0.95  # confidence
+_REFUTING = 2  # images that had the chance to contradict a pose whose inliers could be elsewhere
 _EXACT = 0.006  # predicted relative corner error
 _APPROXIMATE = 0.3  # by which an approximate focal length may be off
 _SETTLED = 0.8  # of the error of the round before: more matches no longer help much
@@ -160,6 +161,8 @@ def _is_enough(attempts: list[Attempt]) -> bool:
     """Whether the last pose is sure, and exact or no longer becoming much more so."""
     last = attempts[-1].evidence
     if last is None or last.confidence < _SURE:
+        return False
+    if last.is_ambiguous and attempts[-1].matches.references < _REFUTING:
         return False
     before = attempts[-2].evidence if len(attempts) > 1 else None
     settled = before is not None and last.predicted_error > _SETTLED * before.predicted_error

@@ -34,6 +34,7 @@ WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
 """Of the terms of `Evidence`, learned by `benchmarks/confidence.py`."""
 
 _RIVAL = RansacOptions(min_inliers=6, max_iterations=150)  # finds what a third of the rest agrees with
+_CLEAR = 0.75  # share of distinct inliers at which a pose is not ambiguous
 _CHECKED = 100  # visible points that are looked for
 _STRONGEST = 2048  # keypoints among which they are
 _NEAR_PX, _FAR_PX = 5.0, 15.0  # from where a point projects: it is there, it is elsewhere
@@ -67,6 +68,11 @@ class Evidence:
     def confidence(self) -> float:
         """Probability that the pose is right."""
         return float(1 / (1 + np.exp(-np.clip(WEIGHTS @ self.terms, -50, 50))))
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether many inliers could be elsewhere, or another pose shows: more should be looked at."""
+        return self.distinct < _CLEAR * self.inliers or self.rival > _RIVAL.min_inliers
 
     @property
     def terms(self) -> Float64[np.ndarray, " terms"]:

@@ -1,0 +1,70 @@
+"""From image file to pose: queries a second on all cores, and what detector settings buy.
+
+    python benchmarks/throughput.py -o /tmp/plane
+
+Takes the rendered objects and the reduced maps that `plane.py` left in the output folder. Each setting
+localizes the same files on as many threads as there are cores; decoding, extraction, matching, pose and
+verification count. Keypoints are cut to the strongest, images shrunk before extraction.
+"""
+
+import argparse
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from slimsfm.datasets.onepose import read_object
+from slimsfm.evaluation.protocol import Query, queries_of
+from slimsfm.execution import num_cores, on_threads
+from slimsfm.geometry import corner_error
+from slimsfm.localization import Localization, Localizer
+from slimsfm.mapping import read_map
+from slimsfm.photos import read_image
+
+SETTINGS = tuple((features, size) for size in (1600, 480, 320) for features in (4096, 2048, 1024, 512))
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", required=True, type=Path)
+    parser.add_argument("--objects", nargs="*", default=["can", "printed_box", "boulder"])
+    arguments = parser.parse_args()
+    print("max features, longer side: queries a second, % within 0.1 and 0.02 d (target 8 a second)")
+    for features, size in SETTINGS:
+        rates, errors = [], []
+        for name in arguments.objects:
+            rate, found = measure(arguments.output, name, features, size)
+            rates.append(rate)
+            errors += found
+        shares = [100 * np.mean(np.array(errors) < fraction) for fraction in (0.1, 0.02)]
+        print(
+            f"{features:5d} {size:5d}: {np.mean(rates):6.1f}  {shares[0]:5.1f} {shares[1]:5.1f}", flush=True
+        )
+
+
+def measure(output: Path, name: str, features: int, size: int) -> tuple[float, list[float]]:
+    """Queries a second, and the error of each."""
+    map_ = read_map(output / "reduced" / f"{name}-points")
+    options = {**map_.info.extractor_options, "max_features": features, "max_image_size": size}
+    localizer = Localizer(replace(map_, info=replace(map_.info, extractor_options=options)))
+    queries = queries_of(read_object(output / "objects" / name).query)
+    start = perf_counter()
+    found = list(on_threads(partial(localize, localizer), queries, num_cores()))
+    rate = len(queries) / (perf_counter() - start)
+    errors = [
+        corner_error(one.pose.cam_from_world, query.cam_from_world, map_.box) if one.pose else np.inf
+        for one, query in zip(found, queries, strict=True)
+    ]
+    return rate, errors
+
+
+def localize(localizer: Localizer, query: Query) -> Localization:
+    """From file to pose."""
+    return localizer.localize(read_image(query.path), query.camera)
+
+
+if __name__ == "__main__":
+    main()
