@@ -122,7 +122,7 @@ class Localizer:
     def __init__(self, map: Map, options: LocalizationOptions = LocalizationOptions()) -> None:
         self.map = map
         self._options = options
-        self._extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+        self.extractor = load_extractor(map.info.extractor, map.info.extractor_options)
         self._memory = local()
         module, attribute = STRATEGIES[options.strategy_for(map)].split(":")
         strategy: Strategy = getattr(import_module(module), attribute)(map, options.matching)
@@ -145,7 +145,7 @@ class Localizer:
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        features = self._extractor.extract(image)
+        features = self.extractor.extract(image)
         return self._localized(features, camera, perf_counter() - start, gravity)
 
     def localize_near(
@@ -170,7 +170,7 @@ class Localizer:
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        features = extract_near(self._extractor, image, self.map.box, near_cam_from_world, camera)
+        features = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
         seconds, query = perf_counter() - start, self._query(features)
         return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 

@@ -7,7 +7,7 @@ from time import perf_counter
 import pycolmap
 
 from slimsfm.arrays import Image
-from slimsfm.features import Features, load_extractor
+from slimsfm.features import Features
 from slimsfm.gravity import Gravity
 from slimsfm.localization.localizer import Localization, Localizer
 
@@ -52,7 +52,7 @@ class MultiLocalizer:
             info, start = localizer.map.info, perf_counter()
             key = repr((info.extractor, sorted(info.extractor_options.items())))
             if key not in extracted:
-                extracted[key] = load_extractor(info.extractor, info.extractor_options).extract(image)
+                extracted[key] = localizer.extractor.extract(image)
             seconds = perf_counter() - start
             one = localizer.localize_features(extracted[key], camera, gravity)
             found[name] = replace(one, seconds=replace(one.seconds, extract=seconds))
