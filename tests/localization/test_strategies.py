@@ -16,7 +16,7 @@ from slimsfm.features import Features, unit_rows
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
 from slimsfm.localization.describing import describe_points
-from slimsfm.localization.strategy import MatchingOptions, Query, Strategy, unite
+from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Strategy, unite
 from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.map import Map
 
@@ -113,7 +113,12 @@ def test_each_round_gives_all_matches_so_far_sorted_and_once(exact, options):
     strategy = strategy_of(exact, options)
     assert isinstance(strategy, Strategy)
     of_image = exact.features["003.png"]
-    query = Query(keypoints=of_image.keypoints.astype(float), descriptors=unit_rows(of_image.descriptors))
+    query = Query(
+        keypoints=of_image.keypoints.astype(float),
+        descriptors=unit_rows(of_image.descriptors),
+        features=of_image,
+        camera=camera(),
+    )
     rounds = [
         list(zip(matches.keypoints.tolist(), matches.points.tolist(), strict=True))
         for matches in strategy.rounds(query)
@@ -169,7 +174,7 @@ def strategy_of(map_: Map, options: LocalizationOptions) -> Strategy:
 
 @given(st.lists(arrays(np.int64, st.tuples(st.integers(0, 5), st.just(2)), elements=st.integers(0, 3))))
 def test_uniting_is_the_union_of_sets(parts):
-    matches = unite(parts)
+    matches = unite([PointMatches(keypoints=part[:, 0], points=part[:, 1]) for part in parts])
     united = sorted({tuple(row) for part in parts for row in part.tolist()})
     assert list(zip(matches.keypoints.tolist(), matches.points.tolist(), strict=True)) == united
 

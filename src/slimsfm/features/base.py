@@ -1,4 +1,4 @@
-"""What every extractor takes and gives."""
+"""What every extractor and every matcher takes and gives."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Int64, Shaped, UInt8
 
-from slimsfm.arrays import Descriptors, GrayImage, Image
+from slimsfm.arrays import Descriptors, GrayImage, Image, IndexPairs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,6 +25,9 @@ class Features:
     image_size: tuple[int, int]
     """Width and height of the upright image in pixels."""
 
+    frames: Float32[np.ndarray, "n 2"] | None = None
+    """Scale in pixels and orientation in radians of each keypoint; None where the detector tells neither."""
+
     def __len__(self) -> int:
         return len(self.keypoints)
 
@@ -35,6 +38,7 @@ class Features:
             descriptors=self.descriptors[rows],
             scores=self.scores[rows],
             image_size=self.image_size,
+            frames=None if self.frames is None else self.frames[rows],
         )
 
 
@@ -54,6 +58,18 @@ class Extractor(Protocol):
 
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
         """Find features, none where the mask, of the image's size, is 0. There may be no feature at all."""
+        ...
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """Matches the features of two images. Equal features give equal matches.
+
+    It is made with one argument, `features`: the name of the extractor whose features it matches.
+    """
+
+    def match(self, features1: Features, features2: Features) -> IndexPairs:
+        """Match two images; no feature occurs twice. Sorted by the feature of the first."""
         ...
 
 

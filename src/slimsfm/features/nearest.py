@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from slimsfm.arrays import IndexPairs
+from slimsfm.features.base import Features, unit_rows
+
 _BLOCK = 256  # rows
 
 
@@ -23,6 +26,32 @@ class NearestOptions:
             raise ValueError(f"max_ratio must be in (0, 1], got {self.max_ratio}")
         if not self.max_distance > 0:
             raise ValueError(f"max_distance must be positive, got {self.max_distance}")
+
+
+SCALES = {
+    "sift": NearestOptions(),
+    "aliked": NearestOptions(max_ratio=0.9, max_distance=0.8),
+    "disk": NearestOptions(max_ratio=0.9, max_distance=0.8),
+    "superpoint": NearestOptions(max_ratio=0.9, max_distance=0.8),
+}
+"""Which neighbours match, by extractor: descriptors of different methods lie apart at different angles."""
+
+
+def nearest_for(extractor: str) -> NearestOptions:
+    """Which neighbours match among the descriptors of an extractor."""
+    return SCALES.get(extractor, NearestOptions())
+
+
+class Nearest:
+    """Matches the features of two images by `match_nearest`."""
+
+    def __init__(self, features: str = "sift") -> None:
+        self._options = nearest_for(features)
+
+    def match(self, features1: Features, features2: Features) -> IndexPairs:
+        """Match two images; no feature occurs twice. Sorted by the feature of the first."""
+        descriptors = unit_rows(features1.descriptors), unit_rows(features2.descriptors)
+        return match_nearest(*descriptors, self._options)
 
 
 def match_nearest(

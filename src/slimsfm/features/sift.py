@@ -65,6 +65,9 @@ class Sift:
         pixels = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2) + np.float32(0.5)
         factors = np.array([width / gray.shape[1], height / gray.shape[0]], np.float32)
         scores = np.array([keypoint.response for keypoint in found], np.float32)
+        frames = np.array([(keypoint.size, keypoint.angle) for keypoint in found], np.float32).reshape(-1, 2)
+        # OpenCV's size is a diameter, its angle in degrees.
+        frames *= np.array([0.5 / scale, np.pi / 180], np.float32)
         # OpenCV may return a few more than asked where responses tie.
         order = np.argsort(-scores, kind="stable")[: self.max_features]
         return Features(
@@ -72,6 +75,7 @@ class Sift:
             descriptors=root_sift(descriptors)[order],
             scores=scores[order],
             image_size=(width, height),
+            frames=frames[order],
         )
 
 

@@ -1,7 +1,8 @@
 """Features and matches on disk, in hloc's HDF5 layout.
 
 `features.h5`: a group an image name with `keypoints` (n, 2), `descriptors` (d, n), `scores` (n) and
-`image_size` (2). `matches.h5`: a group `A/B` a pair of image names ("/" in a name written "-") with
+`image_size` (2), and where the detector tells them `scales` (n) and `oris` (n).
+`matches.h5`: a group `A/B` a pair of image names ("/" in a name written "-") with
 `matches0` (for each keypoint of A its match in B or -1) and `matching_scores0`.
 
 hloc puts the centre of the top-left pixel at (0, 0), everything else here at (0.5, 0.5). This file alone
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Float32, Integer
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
@@ -38,7 +39,7 @@ class FeatureFile(Mapping[str, Features]):
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = _open(path)
+        self._file = opened(path)
         self._path = path
         self._names = dict.fromkeys(sorted(_groups_with(self._file, "keypoints")))
 
@@ -65,7 +66,7 @@ class FeatureFile(Mapping[str, Features]):
         return len(self._names)
 
 
-def _array(file: h5py.File, name: str) -> np.ndarray:
+def read_array(file: h5py.File, name: str) -> np.ndarray:
     """The values of a data set; KeyError where there is none. Five times faster than `file[name][()]`."""
     try:
         found = h5py.h5d.open(file.id, name.encode())
@@ -77,20 +78,30 @@ def _array(file: h5py.File, name: str) -> np.ndarray:
 
 
 def _read_features(file: h5py.File, name: str) -> Features:
-    keypoints = _array(file, f"{name}/keypoints").astype(np.float32)
-    descriptors = _array(file, f"{name}/descriptors").T
-    scores = _array(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
+    keypoints = read_array(file, f"{name}/keypoints").astype(np.float32)
+    descriptors = read_array(file, f"{name}/descriptors").T
+    scores = read_array(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
         raise ValueError(f"{keypoints.shape} keypoints with {descriptors.T.shape} descriptors")
     if not len(keypoints) == len(descriptors) == len(scores):
         raise ValueError(f"{len(keypoints)} keypoints, {len(descriptors)} descriptors, {len(scores)} scores")
-    size = _array(file, f"{name}/image_size") if f"{name}/image_size" in file else np.zeros(2)
+    size = read_array(file, f"{name}/image_size") if f"{name}/image_size" in file else np.zeros(2)
     return Features(
         keypoints=np.ascontiguousarray(keypoints[:, :2]) + _PIXEL_CENTER,
         descriptors=np.ascontiguousarray(descriptors),
         scores=scores.astype(np.float32),
         image_size=(int(size[0]), int(size[1])),
+        frames=_read_frames(file, name, len(keypoints)),
     )
+
+
+def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, "n 2"] | None:
+    if f"{name}/scales" not in file or f"{name}/oris" not in file:
+        return None
+    frames = np.stack([read_array(file, f"{name}/{part}") for part in ("scales", "oris")], axis=1)
+    if frames.shape != (count, 2):
+        raise ValueError(f"{count} keypoints with scales and oris of shape {frames.shape}")
+    return frames.astype(np.float32)
 
 
 class MatchFile(Mapping[tuple[str, str], IndexPairs]):
@@ -103,7 +114,7 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
     """
 
     def __init__(self, path: Path, names: list[str]) -> None:
-        self._file = _open(path)
+        self._file = opened(path)
         self._path = path
         by_key = {_key(name): name for name in names}
         groups = (group.split("/") for group in _groups_with(self._file, "matches0"))
@@ -114,7 +125,7 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
         if pair not in self._pairs:
             raise KeyError(pair)
         try:
-            targets = _array(self._file, f"{_key(pair[0])}/{_key(pair[1])}/matches0").astype(np.int64)
+            targets = read_array(self._file, f"{_key(pair[0])}/{_key(pair[1])}/matches0").astype(np.int64)
         except (KeyError, OSError, TypeError, ValueError) as error:
             raise InputError(f"{self._path}: the matches of {pair} are damaged ({error})") from error
         rows = np.flatnonzero(targets >= 0)
@@ -135,7 +146,7 @@ class FeatureWriter:
 
     def __init__(self, path: Path) -> None:
         self._closing = ExitStack()
-        self._file = self._closing.enter_context(_create(path))
+        self._file = self._closing.enter_context(creating(path))
 
     def __enter__(self) -> "FeatureWriter":
         return self
@@ -158,6 +169,8 @@ def _write_features(file: h5py.File, name: str, features: Features) -> None:
     group["descriptors"] = np.ascontiguousarray(features.descriptors.T)
     group["scores"] = features.scores
     group["image_size"] = np.array(features.image_size, np.int64)
+    if features.frames is not None:
+        group["scales"], group["oris"] = features.frames.T
 
 
 def _write_targets(file: h5py.File, name: str, targets: Integer[np.ndarray, " n"]) -> None:
@@ -171,7 +184,7 @@ def write_matches(
     path: Path, matches: Mapping[tuple[str, str], IndexPairs], num_keypoints: Mapping[str, int]
 ) -> None:
     """Write verified matches, in sorted order of the pairs."""
-    with _create(path) as file:
+    with creating(path) as file:
         for a, b in sorted(matches):
             pairs = matches[a, b]
             kind = np.int16 if num_keypoints[b] <= _INT16_MAX else np.int32
@@ -182,7 +195,8 @@ def write_matches(
 
 
 @contextmanager
-def _create(path: Path) -> Iterator[h5py.File]:
+def creating(path: Path) -> Iterator[h5py.File]:
+    """A new HDF5 file in place of one that may be there; a full disk is an OSError."""
     path.unlink(missing_ok=True)  # who still reads an older file keeps it
     with _PatientFile(path, "w+b") as raw:
         file = None
@@ -214,7 +228,12 @@ class _PatientFile(FileIO):
         return size
 
 
-def _open(path: Path) -> h5py.File:
+def opened(path: Path) -> h5py.File:
+    """An HDF5 file to read.
+
+    Raises:
+        InputError: There is none, or it is damaged.
+    """
     try:
         return h5py.File(path, "r")
     except FileNotFoundError as error:

@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from slimsfm.arrays import Descriptors, Mask
-from slimsfm.features import unit_rows
+from slimsfm.features import nearest_for, unit_rows
 from slimsfm.features.vlad import learn_words, nearest_word
 from slimsfm.mapping.map import Map, PointDescriptors
 
-_ALIKE = np.float32(np.cos(0.35))  # of the descriptors of look-alikes
+_ALIKE = 0.5  # of the largest angle between matching descriptors: look-alikes
 _FAR = 0.1  # of the diagonal: to take a point for one that is nearer hardly harms a pose
 
 
@@ -55,12 +55,13 @@ def _distinct(map: Map, descriptors: Descriptors) -> Mask:
     points, far = map.points3D_in_world, _FAR * map.box.diagonal
     if not len(points):
         return np.zeros(0, dtype=bool)
+    alike_at = np.cos(_ALIKE * nearest_for(map.info.extractor).max_distance)
     words = map.appearance.words if map.appearance else learn_words(descriptors)
     word_of = nearest_word(descriptors, words)
     distinct = np.ones(len(points), dtype=bool)
     for word in range(len(words)):
         members = np.flatnonzero(word_of == word)
-        alike = descriptors[members] @ descriptors[members].T > _ALIKE
+        alike = descriptors[members] @ descriptors[members].T > np.float32(alike_at)
         rows, columns = (members[side] for side in np.nonzero(np.triu(alike, k=1)))
         apart = np.linalg.norm(points[rows] - points[columns], axis=1) > far
         distinct[rows[apart]] = distinct[columns[apart]] = False

@@ -12,7 +12,7 @@ import pycolmap
 from jaxtyping import Int64
 
 from slimsfm.localization.describing import describe_points
-from slimsfm.localization.references import match_target
+from slimsfm.localization.matching import match_target, nearest_options
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
 from slimsfm.mapping.map import Map
 
@@ -24,7 +24,7 @@ class Direct:
     """Matches against all described points at once. O(keypoints x points) a query."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._matching = options.nearest
+        self._nearest = nearest_options(map, options)
         self._described = map.point_descriptors or describe_points(map)
         self._positions = map.points3D_in_world[self._described.points].astype(np.float32)
         self._target = self._described.descriptors, self._described.points
@@ -33,7 +33,7 @@ class Direct:
         """Match the strongest keypoints, then all, with the points' mean descriptors."""
         counts = [count for count in _STRONGEST if count < len(query.descriptors)]
         for count in (*counts, len(query.descriptors)):
-            yield unite([match_target(query.descriptors[:count], self._target, self._matching)])
+            yield unite([match_target(query.descriptors[:count], self._target, self._nearest)])
 
     def expected(
         self,

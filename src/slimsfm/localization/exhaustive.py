@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Int64
 
-from slimsfm.localization.references import References, match_targets
+from slimsfm.localization.references import References
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target
 from slimsfm.mapping.map import Map
 
@@ -13,12 +13,11 @@ class Exhaustive:
     """Matches against all reference images. O(references x keypoints x points seen) a query."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._matching = options.nearest
-        self._references = References(map)
+        self._references = References(map, options)
 
     def rounds(self, query: Query) -> Rounds:
         """Match the query with every reference image, in one round."""
-        yield match_targets(query.descriptors, self._references.targets, self._matching)
+        yield self._references.match(query)
 
     def expected(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None

@@ -146,7 +146,8 @@ class Localizer:
         camera = self.camera_of(image, camera)
         start = perf_counter()
         features = self.extractor.extract(image)
-        return self._localized(features, camera, perf_counter() - start, gravity)
+        seconds, query = perf_counter() - start, self._query(features, camera, image)
+        return self._localization(query, self._search.run(query, camera, gravity), seconds)
 
     def localize_near(
         self, image: Image, camera: pycolmap.Camera | None, near_cam_from_world: pycolmap.Rigid3d
@@ -171,24 +172,19 @@ class Localizer:
         camera = self.camera_of(image, camera)
         start = perf_counter()
         features = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
-        seconds, query = perf_counter() - start, self._query(features)
+        seconds, query = perf_counter() - start, self._query(features, camera, image)
         return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 
     def localize_features(
         self, features: Features, camera: pycolmap.Camera, gravity: Gravity | None = None
     ) -> Localization:
         """Localize an image by features that its map's extractor gave."""
-        return self._localized(features, camera, 0.0, gravity)
+        query = self._query(features, camera)
+        return self._localization(query, self._search.run(query, camera, gravity), 0.0)
 
     def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[Attempt]:
         """Everything that the strategy would try, round by round, without an early stop."""
-        return self._search.attempts(self._query(features), camera)
-
-    def _localized(
-        self, features: Features, camera: pycolmap.Camera, extract_seconds: float, gravity: Gravity | None
-    ) -> Localization:
-        query = self._query(features)
-        return self._localization(query, self._search.run(query, camera, gravity), extract_seconds)
+        return self._search.attempts(self._query(features, camera), camera)
 
     def _localization(self, query: Query, found: Found, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
@@ -197,19 +193,23 @@ class Localizer:
         return Localization(
             pose=pose,
             camera=found.best.camera,
-            points2D=query.keypoints[matches.keypoints],
+            points2D=matches.pixels(query),
             points3D_in_world=self.map.points3D_in_world[matches.points],
             references=found.references,
             predicted_corner_error=evidence and evidence.predicted_error,
             seconds=Seconds(extract=extract_seconds, match=found.match_seconds, pose=found.pose_seconds),
         )
 
-    def _query(self, features: Features) -> Query:
+    def _query(self, features: Features, camera: pycolmap.Camera, image: Image | None = None) -> Query:
         order = np.argsort(-features.scores, kind="stable")
         if np.any(np.diff(order) < 0):
             features = features[order]
         return Query(
-            keypoints=features.keypoints.astype(np.float64), descriptors=self._unit_rows(features.descriptors)
+            keypoints=features.keypoints.astype(np.float64),
+            descriptors=self._unit_rows(features.descriptors),
+            features=features,
+            camera=camera,
+            image=image,
         )
 
     def _unit_rows(self, descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:

@@ -9,11 +9,12 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import Ids, IndexPairs
+from slimsfm.arrays import Ids
 from slimsfm.localization.describing import describe_points
 from slimsfm.localization.landmarks import choose_landmarks
+from slimsfm.localization.matching import match_target, nearest_options
 from slimsfm.localization.ranking import Ranking
-from slimsfm.localization.references import References, match_target, match_targets
+from slimsfm.localization.references import References
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
 from slimsfm.mapping.map import Map
 
@@ -26,15 +27,15 @@ class Progressive:
     """Matches with what promises most, then with ever more; with all reference images when unsure."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._options = options
-        self._references = References(map)
+        self._nearest = nearest_options(map, options)
+        self._references = References(map, options)
         self._ranking = Ranking(map)
         landmarks = describe_points(map)[choose_landmarks(map)]
         self._landmarks = landmarks.descriptors, landmarks.points
 
     def rounds(self, query: Query) -> Rounds:
         """Match in rounds: the landmarks, one image, another, then ever more; last all with all."""
-        parts = [match_target(query.descriptors[:_FIRST], self._landmarks, self._options.nearest)]
+        parts = [match_target(query.descriptors[:_FIRST], self._landmarks, self._nearest)]
         matches = unite(parts)
         pose = yield matches
         similarities, tried = self._ranking.similarities(query), []
@@ -42,14 +43,10 @@ class Progressive:
             agreeing = matches.points[pose.inliers] if pose else matches.points
             for _ in range(max(1, round(_GROWTH * len(tried)))):
                 tried.append(self._next(similarities, tried, agreeing))
-                parts.append(self._match(query, tried[-1]))
-            matches = unite(parts, references=len(tried))
+                parts.append(self._references.match(query, tried[-1:], _STRONGEST))
+            matches = unite(parts)
             pose = yield matches
-        yield match_targets(query.descriptors, self._references.targets, self._options.nearest)
-
-    def _match(self, query: Query, row: int) -> IndexPairs:
-        target = self._references.targets[row]
-        return match_target(query.descriptors[:_STRONGEST], target, self._options.nearest)
+        yield self._references.match(query)
 
     def _next(self, similarities: Float32[np.ndarray, " references"], tried: list[int], agreeing: Ids) -> int:
         """The image that promises most of those not tried: in turn one to confirm and one to refute."""

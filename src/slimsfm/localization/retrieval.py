@@ -10,7 +10,7 @@ import pycolmap
 from jaxtyping import Int64
 
 from slimsfm.localization.ranking import Ranking
-from slimsfm.localization.references import References, match_targets
+from slimsfm.localization.references import References
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target
 from slimsfm.mapping.map import Map
 
@@ -19,15 +19,14 @@ class Retrieval:
     """Matches against a fixed number of reference images, those of most similar appearance."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._options = options
-        self._references = References(map)
+        self._retrieved = options.retrieved
+        self._references = References(map, options)
         self._ranking = Ranking(map)
 
     def rounds(self, query: Query) -> Rounds:
         """Match the query with the images that resemble it, in one round."""
         order = np.argsort(-self._ranking.similarities(query), kind="stable")
-        chosen = [self._references.targets[row] for row in order[: self._options.retrieved]]
-        yield match_targets(query.descriptors, chosen, self._options.nearest)
+        yield self._references.match(query, order[: self._retrieved].tolist())
 
     def expected(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None

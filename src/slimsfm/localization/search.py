@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import pycolmap
 
+from slimsfm.features import nearest_for
 from slimsfm.focal import estimate_pose_and_focal
 from slimsfm.geometry import project
 from slimsfm.gravity import Gravity, estimate_upright_pose
 from slimsfm.localization.cameras import FocalLength
 from slimsfm.localization.describing import describe_points
 from slimsfm.localization.guided import match_near
-from slimsfm.localization.strategy import PointMatches, Query, Strategy
+from slimsfm.localization.strategy import Cropping, PointMatches, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -94,10 +95,13 @@ class Search:
     def near(self, query: Query, camera: pycolmap.Camera, near_cam_from_world: pycolmap.Rigid3d) -> Found:
         """Localize a query that was taken about from there: points are sought near where they project."""
         start = perf_counter()
-        target = self._strategy.expected(near_cam_from_world)
-        pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
-        attempt = self._attempt(query, match_near(query, target, pixels, camera), camera, start)
-        return _summed([attempt])
+        if isinstance(self._strategy, Cropping):
+            matches = self._strategy.near(query, near_cam_from_world)
+        else:
+            target = self._strategy.expected(near_cam_from_world)
+            pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
+            matches = match_near(query, target, pixels, camera, nearest_for(self._map.info.extractor))
+        return _summed([self._attempt(query, matches, camera, start)])
 
     def attempts(
         self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None
@@ -140,7 +144,7 @@ class Search:
     def _estimate(
         self, query: Query, matches: PointMatches, camera: pycolmap.Camera, gravity: Gravity | None
     ) -> "_Posed":
-        points2D, points3D = query.keypoints[matches.keypoints], self._map.points3D_in_world[matches.points]
+        points2D, points3D = matches.pixels(query), self._map.points3D_in_world[matches.points]
         if self._focal == "known":
             if gravity is None:
                 return _Posed(estimate_pose(points2D, points3D, camera, self._ransac), camera)

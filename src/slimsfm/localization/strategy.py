@@ -1,6 +1,6 @@
 """What every way of matching a query against a map takes and gives."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -8,14 +8,14 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import Descriptors, Ids, Points2D
-from slimsfm.features import NearestOptions
+from slimsfm.arrays import Descriptors, Ids, Image, Points2D
+from slimsfm.features import Features, NearestOptions
 from slimsfm.pose import PoseEstimate
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Query:
-    """The local features of a query, the strongest first."""
+    """A query and its local features, the strongest first."""
 
     keypoints: Points2D
     """Pixels."""
@@ -23,13 +23,22 @@ class Query:
     descriptors: Descriptors
     """Row i describes keypoint i. Their memory is used again for the next query."""
 
+    features: Features
+    """The features as the extractor gave them, in the same order."""
+
+    camera: pycolmap.Camera
+    """The intrinsics, or a guess of them where the focal length is not known."""
+
+    image: Image | None = None
+    """The image itself, for strategies that look at it; None where only its features are known."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointMatches:
     """Matches between the keypoints of a query and the points of a map; a pair occurs once."""
 
     keypoints: Ids
-    """Rows of the query's features."""
+    """Rows of the query's features, or of `points2D` where that is given."""
 
     points: Ids
     """Rows of the map's points."""
@@ -37,21 +46,34 @@ class PointMatches:
     references: int = 0
     """Reference images that the query was matched with to find them."""
 
+    points2D: Points2D | None = None
+    """Pixels of keypoints that a strategy found itself; None where they are the query's."""
+
+    def pixels(self, query: Query) -> Points2D:
+        """Where in the query each match is."""
+        keypoints = query.keypoints if self.points2D is None else self.points2D
+        return keypoints[self.keypoints]
+
     def __len__(self) -> int:
         return len(self.keypoints)
 
     @classmethod
     def none(cls) -> "PointMatches":
         """No matches."""
-        return unite([])
+        nothing = np.zeros(0, np.int64)
+        return cls(keypoints=nothing, points=nothing)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions:
     """How strategies match."""
 
-    nearest: NearestOptions = NearestOptions()
-    """Which nearest neighbours are matches."""
+    matcher: str = "auto"
+    """How the query and a reference image are matched; auto: by nearest neighbours, or without a detector
+    where the map was built so."""
+
+    nearest: NearestOptions | None = None
+    """Which nearest neighbours are matches; None: what suits the map's descriptors."""
 
     retrieved: int = 2
     """Reference images that `retrieval` matches a query with."""
@@ -92,9 +114,33 @@ class Strategy(Protocol):
         ...
 
 
-def unite(parts: list[Int64[np.ndarray, "_ 2"]], references: int = 0) -> PointMatches:
-    """Join pairs (keypoint, point) from several sources; equal ones become one. Sorted."""
-    pairs = np.concatenate([np.zeros((0, 2), np.int64), *parts])
-    _, first = np.unique((pairs[:, 0] << 32) | pairs[:, 1], return_index=True)
-    pairs = pairs[first]
-    return PointMatches(keypoints=pairs[:, 0], points=pairs[:, 1], references=references)
+@runtime_checkable
+class Cropping(Protocol):
+    """A strategy that looks at a part of the image of its own, where the pose says that the object is."""
+
+    def near(self, query: Query, near_cam_from_world: pycolmap.Rigid3d) -> PointMatches:
+        """Match a query that was taken about from there."""
+        ...
+
+
+def unite(parts: Sequence[PointMatches]) -> PointMatches:
+    """Join matches from several sources; equal ones become one. Sorted by keypoint, then point."""
+    keypoints = np.concatenate([np.zeros(0, np.int64), *_numbered_through(parts)])
+    points = np.concatenate([np.zeros(0, np.int64), *(part.points for part in parts)])
+    _, first = np.unique((keypoints << 32) | points, return_index=True)
+    found = [part.points2D for part in parts if part.points2D is not None]
+    return PointMatches(
+        keypoints=keypoints[first],
+        points=points[first],
+        references=sum(part.references for part in parts),
+        points2D=np.concatenate(found) if found else None,
+    )
+
+
+def _numbered_through(parts: Sequence[PointMatches]) -> list[Ids]:
+    """The parts' keypoints; those that strategies found themselves are rows of all such together."""
+    numbered, start = [], 0
+    for part in parts:
+        numbered.append(part.keypoints + start)
+        start += 0 if part.points2D is None else len(part.points2D)
+    return numbered

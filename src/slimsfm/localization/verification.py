@@ -22,6 +22,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
+from slimsfm.features import nearest_for
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map, PointDescriptors
@@ -38,7 +39,6 @@ _CLEAR = 0.75  # share of distinct inliers at which a pose is not ambiguous
 _CHECKED = 100  # visible points that are looked for
 _STRONGEST = 2048  # keypoints among which they are
 _NEAR_PX, _FAR_PX = 5.0, 15.0  # from where a point projects: it is there, it is elsewhere
-_ALIKE = 0.7  # radians between descriptors that look alike
 _MAX_RATIO = 0.9  # of the angle of the keypoint there to that of the best one elsewhere
 
 
@@ -97,6 +97,7 @@ class Verifier:
         self._points3D_in_world = map.points3D_in_world
         self._box = map.box
         self._strategy = strategy
+        self._alike = nearest_for(map.info.extractor).max_distance
         self._distinct = np.ones(len(map.point3D_ids), dtype=bool)
         if described.distinct is not None:
             self._distinct[described.points] = described.distinct
@@ -119,16 +120,21 @@ class Verifier:
             distinct=_count(agreeing[self._distinct[points]]),
             matched=_count(matches.keypoints),
             predicted_error=pose.predicted_corner_error(self._box),
-            rival=self._rival(query, matches.keypoints[others], matches.points[others], pose, camera),
+            rival=self._rival(matches, matches.pixels(query), others, pose, camera),
             found=self._found(query, points, pose, camera),
         )
 
     def _rival(
-        self, query: Query, keypoints: Ids, points: Ids, pose: PoseEstimate, camera: pycolmap.Camera
+        self,
+        matches: PointMatches,
+        pixels: Points2D,
+        others: Mask,
+        pose: PoseEstimate,
+        camera: pycolmap.Camera,
     ) -> int:
-        """How many keypoints agree with the best other pose."""
-        points3D = self._points3D_in_world[points]
-        other = estimate_pose(query.keypoints[keypoints], points3D, camera, _RIVAL)
+        """How many keypoints agree with the best other pose, by the matches that disagree with this one."""
+        keypoints, points3D = matches.keypoints[others], self._points3D_in_world[matches.points[others]]
+        other = estimate_pose(pixels[others], points3D, camera, _RIVAL)
         if other is None or corner_error(other.cam_from_world, pose.cam_from_world, self._box) < RIGHT:
             return 0
         return _count(keypoints[other.inliers])
@@ -142,7 +148,7 @@ class Verifier:
         if not len(visible):
             return 0.0
         visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
-        return float(_found_there_alone(query, pixels[visible], descriptors[visible]).mean())
+        return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
 
 
 def _count(keypoints: Ids) -> int:
@@ -150,7 +156,7 @@ def _count(keypoints: Ids) -> int:
     return len(np.unique(keypoints))
 
 
-def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors) -> Mask:
+def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors, alike: float) -> Mask:
     """Which places have a keypoint near them that looks as it should, better than any far from them."""
     keypoints = query.keypoints[:_STRONGEST]
     if not len(keypoints):
@@ -158,7 +164,7 @@ def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors)
     cosines = descriptors @ query.descriptors[:_STRONGEST].T
     best = cosines.argmax(axis=1)
     angles = np.arccos(np.clip(cosines[np.arange(len(places)), best], -1, 1))
-    found = (np.linalg.norm(places - keypoints[best], axis=1) < _NEAR_PX) & (angles <= _ALIKE)
+    found = (np.linalg.norm(places - keypoints[best], axis=1) < _NEAR_PX) & (angles <= alike)
     rows = np.flatnonzero(found)
     which, others = np.nonzero(cosines[rows] > np.cos(angles[rows] / _MAX_RATIO)[:, None])
     apart = np.linalg.norm(places[rows[which]] - keypoints[others], axis=1) > _FAR_PX

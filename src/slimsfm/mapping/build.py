@@ -7,7 +7,7 @@ from pathlib import Path
 import pycolmap
 
 from slimsfm.errors import InputError
-from slimsfm.features import Extractor, load_extractor
+from slimsfm.features import Extractor, load_extractor, load_matcher
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.appearance import with_appearance
@@ -15,6 +15,7 @@ from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.cameras import CameraSharing, guess_cameras
 from slimsfm.mapping.extraction import color_points, extract_features
 from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.pair_matching import match_pairs_with, verify_pairs
 from slimsfm.mapping.pairs import PairChoice, choose_pairs
 from slimsfm.mapping.sfm import match_pairs, reconstruct, triangulate, verified_matches, write_database
 from slimsfm.photos import list_images
@@ -35,11 +36,18 @@ class BuildOptions:
     masks: Path | None = None
     """Folder of masks, NAME.png for image NAME (COLMAP's convention): no features where they are black."""
 
-    max_image_size: int = 1600
-    """Shrink larger images for extraction so that their longer side has this many pixels."""
+    extractor: str = "sift"
+    """Local features, see `slimsfm methods`; loftr finds none and matches images as wholes."""
 
-    max_features: int = 4096
-    """Most features of one image."""
+    matcher: str = "nearest"
+    """What matches features: nearest, lightglue or superglue."""
+
+    max_image_size: int | None = None
+    """Shrink larger images for extraction so that their longer side has this many pixels; else as the
+    extractor does by itself: SIFT to 1600, learned ones to 1024, loftr to 640."""
+
+    max_features: int | None = None
+    """Most features of one image; else what the extractor does by itself: SIFT 4096, learned ones 2048."""
 
     box: Path | None = None
     """The object's box: JSON or OnePose's box3d_corners.txt. Without it the box is estimated."""
@@ -135,7 +143,9 @@ def _build(map: Map, names: list[str]) -> Build:
 
 def _extractor(options: BuildOptions) -> Extractor:
     wishes = {"max_features": options.max_features, "max_image_size": options.max_image_size}
-    return load_extractor("sift", wishes)
+    return load_extractor(
+        options.extractor, {key: value for key, value in wishes.items() if value is not None}
+    )
 
 
 def _match(
@@ -147,6 +157,12 @@ def _match(
 ) -> Path:
     database = workspace / "database.db"
     write_database(database, features, cameras)
-    pairs = choose_pairs(features, options.pairs, seed=options.seed)
-    match_pairs(database, list(features), pairs, seed=options.seed, progress=progress)
+    names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
+    if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
+        match_pairs(database, names, pairs, seed=options.seed, progress=progress)
+    else:
+        matches = match_pairs_with(
+            load_matcher(options.matcher, options.extractor), features, pairs, progress
+        )
+        verify_pairs(database, names, matches, seed=options.seed)
     return database

@@ -19,7 +19,9 @@ def direct_map(map: Map, chosen: PointDescriptors) -> Map:
     copy_points(map, model, {point3D_id: [] for point3D_id in map.point3D_ids[chosen.points].tolist()})
     points = np.arange(len(chosen.points), dtype=np.int64)
     descriptors = replace(chosen, points=points)
-    return replace(map, model=model, features={}, matches={}, appearance=None, point_descriptors=descriptors)
+    return replace(
+        map, model=model, features={}, matches={}, photos={}, appearance=None, point_descriptors=descriptors
+    )
 
 
 def with_points(slim: Map, map: Map, chosen: PointDescriptors) -> Map:

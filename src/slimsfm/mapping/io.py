@@ -4,6 +4,7 @@ MAP/
   sparse/       COLMAP model, opens in COLMAP, pycolmap and hloc
   features.h5   local features in hloc's layout
   matches.h5    verified matches in hloc's layout; may be missing
+  photos.h5     the photos, small; in maps built without a detector
   global.npz    global descriptors of the images; may be missing
   points.npz    points to match directly; may be missing, or there instead of features.h5 and matches.h5
   map.json      format version, extractor and its options, box, unit, origin
@@ -23,6 +24,7 @@ from slimsfm.geometry import Box
 from slimsfm.mapping.appearance import read_appearance, write_appearance
 from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
+from slimsfm.mapping.photo_file import PhotoFile, write_photos
 from slimsfm.mapping.point_file import read_point_descriptors, write_point_descriptors
 
 FORMAT_VERSION = 1
@@ -41,7 +43,7 @@ def read_map(path: Path) -> Map:
         points = path / "points.npz"
         direct = read_point_descriptors(points, model.num_points3D()) if points.exists() else None
         names = sorted(model.image(i).name for i in model.reg_image_ids())
-        matches, appearance = path / "matches.h5", path / "global.npz"
+        matches, appearance, photos = (path / part for part in ("matches.h5", "global.npz", "photos.h5"))
         features = (
             None if direct and not (path / "features.h5").exists() else FeatureFile(path / "features.h5")
         )
@@ -51,6 +53,7 @@ def read_map(path: Path) -> Map:
             matches=MatchFile(matches, names) if matches.exists() else {},
             point_descriptors=direct,
             appearance=read_appearance(appearance, len(names)) if appearance.exists() else None,
+            photos=PhotoFile(photos) if photos.exists() else {},
             info=info,
         )
         check_map(map_)
@@ -78,6 +81,8 @@ def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
         if map.matches:
             counts = {name: image.num_points2D() for name, image in map.images.items()}
             write_matches(partial / "matches.h5", map.matches, counts)
+        if map.photos:
+            write_photos(partial / "photos.h5", map.photos)
         if map.appearance:
             write_appearance(partial / "global.npz", map.appearance)
         if map.point_descriptors:
@@ -108,7 +113,8 @@ def bytes_by_part(path: Path) -> dict[str, int]:
     sizes = {
         part.name: sum(file.stat().st_size for file in [part, *part.rglob("*")] if file.is_file())
         for part in sorted(path.iterdir())
-        if part.name in ("sparse", "features.h5", "matches.h5", "global.npz", "points.npz", "map.json")
+        if part.name
+        in ("sparse", "features.h5", "matches.h5", "photos.h5", "global.npz", "points.npz", "map.json")
     }
     return {**sizes, "total": sum(sizes.values())}
 

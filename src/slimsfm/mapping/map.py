@@ -10,7 +10,7 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 from scipy.sparse import csr_array
 
-from slimsfm.arrays import Descriptors, Ids, IndexPairs, Mask, Points3D
+from slimsfm.arrays import Descriptors, Ids, Image, IndexPairs, Mask, Points3D
 from slimsfm.errors import MapError
 from slimsfm.features import Features
 from slimsfm.geometry import Box
@@ -105,6 +105,9 @@ class Map:
 
     matches: Mapping[tuple[str, str], IndexPairs] = field(default_factory=dict)
     """Verified matches by pair of image names; empty where the map has none."""
+
+    photos: Mapping[str, Image] = field(default_factory=dict)
+    """The reference photos by image name, small; just in maps built without a detector."""
 
     appearance: Appearance | None = None
     """By what reference images that resemble a query are found; None where it has to be made anew."""

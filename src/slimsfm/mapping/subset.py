@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import pycolmap
 
-from slimsfm.arrays import IndexPairs
+from slimsfm.arrays import Image, IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features import Features
 from slimsfm.mapping.map import Appearance, Map, check_has_features
@@ -37,12 +37,14 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
     chosen = frozenset(kept)
     features: Mapping[str, Features] = Selection(map.features, chosen.__contains__)
     matches: Mapping[tuple[str, str], IndexPairs] = Selection(map.matches, chosen.issuperset)
+    photos: Mapping[str, Image] = Selection(map.photos, chosen.__contains__)
     model = _subset_model(map, kept, min_track_length)
     return replace(
         map,
         model=model,
         features=features,
         matches=matches,
+        photos=photos,
         appearance=_appearance_of(map, chosen),
         point_descriptors=None,
     )

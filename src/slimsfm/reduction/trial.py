@@ -16,9 +16,10 @@ from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
+from slimsfm.features import nearest_for
 from slimsfm.geometry import corner_error, reprojection_errors
-from slimsfm.localization.references import match_targets, reference_target
-from slimsfm.localization.strategy import Target
+from slimsfm.localization.matching import match_target, reference_target
+from slimsfm.localization.strategy import Target, unite
 from slimsfm.mapping.map import Map, observed
 from slimsfm.mapping.point_file import quantize
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -80,6 +81,7 @@ class Trials:
     def __init__(self, map: Map, left_out: LeftOut) -> None:
         self._map = map
         self._left_out = left_out
+        self._matching = nearest_for(map.info.extractor)
         names = list(map.images)
         places = np.linspace(0, len(names) - 1, min(_MOST_TESTS, len(names))).round().astype(int)
         self.tests = tuple(names[place] for place in places)
@@ -120,7 +122,7 @@ class Trials:
     def _try(self, name: str, targets: list[Target]) -> _Trial:
         query, camera = self._left_out.query(name), self._map.camera(name)
         start = perf_counter()
-        matches = match_targets(query.descriptors, targets)
+        matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
         seconds = perf_counter() - start
         points2D = query.keypoints[matches.keypoints]
         points3D = self._map.points3D_in_world[matches.points]

@@ -1,0 +1,90 @@
+"""What all learned extractors share: images into tensors, what networks find into features."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from slimsfm.arrays import GrayImage, Image
+from slimsfm.features.base import Features
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NetworkInput:
+    """An image as a network sees it."""
+
+    pixels: Float[Tensor, "1 3 h w"]
+    """RGB from 0 to 1."""
+
+    factors: Float32[np.ndarray, "2"]
+    """What pixels (x, y) of it are multiplied with to be pixels of the image."""
+
+    image_size: tuple[int, int]
+    """Width and height of the image."""
+
+
+def network_input(image: Image, max_image_size: int, device: torch.device) -> NetworkInput:
+    """Shrink an image, so that its longer side has at most so many pixels, and hand it to a device."""
+    height, width = image.shape[:2]
+    scale = min(1.0, max_image_size / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    pixels = torch.from_numpy(np.ascontiguousarray(small)).to(device).permute(2, 0, 1)[None]
+    return NetworkInput(
+        pixels=pixels.to(torch.float32) / 255,
+        factors=np.array([width / size[0], height / size[1]], np.float32),
+        image_size=(width, height),
+    )
+
+
+def features_of(
+    taken: NetworkInput,
+    keypoints: Float[Tensor, "n 2"],
+    descriptors: Float[Tensor, "n d"],
+    scores: Float[Tensor, " n"],
+    mask: GrayImage | None,
+    max_features: int,
+) -> Features:
+    """Features of the whole image: the strongest, none where the mask is 0.
+
+    Args:
+        taken: What the network saw.
+        keypoints: Pixels of that, the centre of the top-left one at (0, 0).
+        descriptors: Of unit length; kept in half precision.
+        scores: The larger the surer.
+        mask: Of the image's size.
+        max_features: How many to keep.
+    """
+    width, height = taken.image_size
+    pixels = (_numpy(keypoints) + np.float32(0.5)) * taken.factors
+    strength = _numpy(scores)
+    order = np.argsort(-strength, kind="stable")
+    if mask is not None:
+        columns, rows = np.clip(pixels.astype(np.int64), 0, (width - 1, height - 1)).T
+        order = order[mask[rows, columns][order] > 0]
+    order = order[:max_features]
+    return Features(
+        keypoints=pixels[order],
+        descriptors=_numpy(descriptors)[order].astype(np.float16),
+        scores=strength[order],
+        image_size=taken.image_size,
+    )
+
+
+def _numpy(values: Tensor) -> Float32[np.ndarray, "..."]:
+    return values.detach().to("cpu", torch.float32).numpy()
+
+
+def check_sizes(max_features: int, max_image_size: int) -> None:
+    """Make sure that an extractor's limits make sense.
+
+    Raises:
+        ValueError: They do not.
+    """
+    if max_features < 1:
+        raise ValueError(f"max_features must be at least 1, got {max_features}")
+    if max_image_size < 32:
+        raise ValueError(f"max_image_size must be at least 32, got {max_image_size}")

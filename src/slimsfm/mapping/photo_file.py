@@ -1,0 +1,74 @@
+"""The reference photos, small: for matching without keypoints, which looks at the photos themselves.
+
+`photos.h5` holds a JPEG file an image name.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+
+from slimsfm.arrays import Image
+from slimsfm.errors import InputError
+from slimsfm.features.store import creating, opened, read_array
+
+_QUALITY = 95
+
+
+class PhotoFile(Mapping[str, Image]):
+    """The photos of a file by image name, read when asked for; names are sorted.
+
+    Raises:
+        InputError: The file is missing or no such file, at construction; a photo is damaged, at access.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file, self._path = opened(path), path
+        found: list[str] = []
+        self._file.visititems(
+            lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None
+        )
+        self._names = dict.fromkeys(sorted(found))
+
+    def __getitem__(self, name: str) -> Image:
+        if name not in self._names:
+            raise KeyError(name)
+        try:
+            photo = cv2.imdecode(np.asarray(read_array(self._file, name), np.uint8), cv2.IMREAD_COLOR_RGB)
+        except (cv2.error, OSError, TypeError, ValueError) as error:
+            raise InputError(f"{self._path}: the photo of {name!r} is damaged ({error})") from error
+        if photo is None:
+            raise InputError(f"{self._path}: the photo of {name!r} is damaged")
+        return np.asarray(photo, np.uint8)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def write_photos(path: Path, photos: Mapping[str, Image]) -> None:
+    """Write photos, in sorted order of their names."""
+    with creating(path) as file:
+        for name in sorted(photos):
+            file[name] = _jpeg(photos[name])
+
+
+def _jpeg(photo: Image) -> np.ndarray:
+    bgr = cv2.cvtColor(photo, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].ravel()
+
+
+def shrink_photo(photo: Image, max_image_size: int) -> Image:
+    """Shrink a photo, unless it is small, so that its longer side has so many pixels; as it is read back."""
+    height, width = photo.shape[:2]
+    scale = min(1.0, max_image_size / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = photo if scale == 1.0 else cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.imdecode(_jpeg(np.asarray(small, np.uint8)), cv2.IMREAD_COLOR_RGB), np.uint8)

@@ -1,0 +1,1 @@
+"""Networks in PyTorch, by the names that their published weights use."""

@@ -1,0 +1,153 @@
+"""Weights into networks: whole and fitting, or not at all."""
+
+import pickle
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from slimsfm.errors import InputError
+from slimsfm.networks.devices import choose_device
+from slimsfm.weights import WEIGHTS, check_weights, find_weights, missing, remind_of_licence
+
+Network = TypeVar("Network", bound=nn.Module)
+State = dict[str, Tensor]
+
+_PLAIN = {"collections", "torch", "torch._utils", "torch.nn.parameter", "torch.storage"}
+_PLAIN_NAMES = {"OrderedDict", "Size", "_rebuild_tensor_v2", "_rebuild_parameter"}
+
+
+def load_network(
+    network: Network,
+    name: str,
+    state_of: Callable[[Mapping], State] = dict,
+    derived: Collection[str] = (),
+) -> Network:
+    """Fill a network with published weights and put it where networks run, ready for inference.
+
+    Args:
+        network: As constructed.
+        name: Key of `slimsfm.weights.WEIGHTS`.
+        state_of: Makes the network's own state dict of what the file holds.
+        derived: Values that the network computes itself, which a file may lack.
+
+    Raises:
+        InputError: The weights are missing, damaged, or of another network.
+    """
+    path = find_weights(name) or _from_hub(name)
+    load_state(network, path, state_of, derived)
+    remind_of_licence(name)
+    return network.to(choose_device()).eval().requires_grad_(False)
+
+
+def load_state(
+    network: nn.Module,
+    path: Path,
+    state_of: Callable[[Mapping], State] = dict,
+    derived: Collection[str] = (),
+) -> None:
+    """Load a file into a network, every value of it or none; arguments as of `load_network`.
+
+    Raises:
+        InputError: The file is damaged or of another network.
+    """
+    try:
+        own = {key: value for key, value in network.state_dict().items() if key in derived}
+        state = {**own, **state_of(_read(path))}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: these are not the weights of {_name(network)} ({error!r})") from error
+    wanted = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in state.items()}
+    if wanted != found:
+        raise InputError(
+            f"{path}: these are not the weights of {_name(network)}: {_difference(wanted, found)}"
+        )
+    network.load_state_dict(state, strict=True)
+
+
+def _difference(wanted: dict[str, tuple], found: dict[str, tuple]) -> str:
+    key = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
+    if key not in found:
+        return f"{key} is missing"
+    if key not in wanted:
+        return f"{key} is not one of its values"
+    return f"{key} has shape {found[key]} instead of {wanted[key]}"
+
+
+def _name(network: nn.Module) -> str:
+    return type(network).__name__
+
+
+def _read(path: Path) -> Mapping:
+    """What a file of weights holds, without running any code that it may hold."""
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        return torch.load(path, map_location="cpu", weights_only=False, pickle_module=_HARMLESS)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # what a damaged file raises is anybody's guess
+        raise InputError(f"{path}: not a file of weights, or damaged ({error})") from error
+
+
+class _Ignored(dict):
+    """Stands for what checkpoints of training frameworks hold beside weights."""
+
+    def __new__(cls, *_args: object, **_kwargs: object) -> "_Ignored":
+        return super().__new__(cls)
+
+    def __init__(self, *_args: object, **_kwargs: object) -> None:
+        super().__init__()
+
+    def __setstate__(self, _state: object) -> None: ...
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        is_storage = module == "torch" and name.endswith("Storage")
+        if module in _PLAIN and (name in _PLAIN_NAMES or is_storage):
+            return super().find_class(module, name)
+        return _Ignored
+
+
+_HARMLESS = ModuleType("slimsfm_harmless_pickle")
+_HARMLESS.Unpickler = _Unpickler  # pyright: ignore[reportAttributeAccessIssue]
+_HARMLESS.load = lambda file, **options: _Unpickler(file, **options).load()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _from_hub(name: str) -> Path:
+    """The file in its library's cache, where the library puts it if there is a network."""
+    weights = WEIGHTS[name]
+    for address in weights.hub:
+        path = _from_hugging_face(address) if address.startswith("hf:") else _from_address(address)
+        if path is not None:
+            if not address.startswith("hf:"):
+                check_weights(path, weights)
+            return path
+    raise missing(weights)
+
+
+def _from_hugging_face(address: str) -> Path | None:
+    from huggingface_hub import hf_hub_download
+
+    owner, repository, file = address.removeprefix("hf:").split("/")
+    try:
+        return Path(hf_hub_download(f"{owner}/{repository}", file))
+    except Exception:  # no network, no such file, an odd proxy: all mean that it cannot be had
+        return None
+
+
+def _from_address(address: str) -> Path | None:
+    path = Path(torch.hub.get_dir()) / "checkpoints" / address.rpartition("/")[2]
+    try:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.hub.download_url_to_file(address, str(path), progress=False)
+        return path
+    except Exception:  # as above
+        return None
