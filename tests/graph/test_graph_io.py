@@ -6,7 +6,6 @@ import pytest
 
 from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
 from slimsfm.errors import InputError
-from slimsfm.features import NearestOptions
 from slimsfm.geometry import Box
 from slimsfm.graph import GraphOptions, compute
 from slimsfm.graph.io import graph_of, read_given_graph, write_graph
@@ -109,11 +108,11 @@ def test_the_key_of_equal_maps_is_equal(exact, tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        GraphOptions(matching=NearestOptions(max_ratio=0.9)),
+        GraphOptions(edges="localize", matcher="nearest"),
         GraphOptions(ransac=RansacOptions(seed=1)),
         GraphOptions(ransac=RansacOptions(max_error_px=4.0)),
     ],
-    ids=["ratio", "seed", "error"],
+    ids=["matcher", "seed", "error"],
 )
 def test_other_options_make_another_key_and_compute_again(exact, options, tmp_path):
     options = replace(options, edges="localize")
@@ -286,8 +285,8 @@ def test_a_bad_graph_of_another_system_is_named(exact, tmp_path, change):
 @pytest.mark.parametrize(
     ("edges", "ignored"),
     [
-        ("matches", {"threshold": 0.1, "candidates": "all", "matching": NearestOptions(max_ratio=0.9)}),
-        ("tracks", {"threshold": 0.1, "candidates": "all", "matching": NearestOptions(max_ratio=0.9)}),
+        ("matches", {"threshold": 0.1, "candidates": "all", "matcher": "nearest"}),
+        ("tracks", {"threshold": 0.1, "candidates": "all", "matcher": "nearest"}),
         ("localize", {"threshold": 0.1}),
         ("hybrid", {"candidates": "all"}),
     ],

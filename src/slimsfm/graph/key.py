@@ -20,5 +20,5 @@ def _relevant(map: Map, options: GraphOptions) -> GraphOptions:
         edges=edges,
         threshold=options.threshold if edges == "hybrid" else default.threshold,
         candidates=options.candidates if edges == "localize" else default.candidates,
-        matching=options.matching if edges in ("localize", "hybrid") else default.matching,
+        matcher=options.matcher if edges in ("localize", "hybrid") else default.matcher,
     )

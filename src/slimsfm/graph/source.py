@@ -10,7 +10,6 @@ from jaxtyping import Int64
 
 from slimsfm.arrays import Ids, Points2D
 from slimsfm.errors import InputError
-from slimsfm.features import NearestOptions
 from slimsfm.geometry import corner_error
 from slimsfm.mapping.map import Map
 from slimsfm.pose import RansacOptions, estimate_pose
@@ -37,8 +36,9 @@ class GraphOptions:
     threshold: float = 0.05
     """Relative corner error below which an image counts as localized; `hybrid` looks closer around it."""
 
-    matching: NearestOptions = NearestOptions()
-    """Which keypoints match, where images are matched anew."""
+    matcher: str = "auto"
+    """What matches images, where they are matched anew; auto: nearest neighbours, or without a detector where
+    the map was built so."""
 
     ransac: RansacOptions = RansacOptions()
     """The pose search."""

@@ -1,5 +1,6 @@
 """How a query is matched with one reference image: nearest descriptors, a network, or without keypoints."""
 
+from functools import lru_cache
 from importlib import import_module
 from typing import Protocol, runtime_checkable
 
@@ -24,13 +25,13 @@ class ReferenceMatching(Protocol):
         ...
 
 
-def nearest_options(map: Map, options: MatchingOptions) -> NearestOptions:
-    """Which nearest neighbours match: as the options say, or as suits the map's descriptors."""
-    return options.nearest or nearest_for(map.info.extractor)
-
-
-def matching_with(map: Map, options: MatchingOptions) -> ReferenceMatching:
+def matching_with(map: Map, options: MatchingOptions, cached: int | None = None) -> ReferenceMatching:
     """The way of matching that the options ask for.
+
+    Args:
+        map: The map.
+        options: What matches.
+        cached: Images of which what there is to match is kept in memory; None: all.
 
     Raises:
         InputError: There is no such matcher, or it cannot match features of the map's kind.
@@ -40,10 +41,10 @@ def matching_with(map: Map, options: MatchingOptions) -> ReferenceMatching:
     if name == "auto":
         name = extractor if extractor in DETECTOR_FREE else "nearest"
     if name == "nearest":
-        return NearestMatching(map, nearest_options(map, options))
+        return NearestMatching(map, nearest_for(extractor), cached)
     if name in DETECTOR_FREE:
         return import_module("slimsfm.localization.detector_free").DetectorFreeMatching(map)
-    return PairMatching(map, load_matcher(name, extractor))
+    return PairMatching(map, load_matcher(name, extractor), cached)
 
 
 class NearestMatching:
@@ -52,35 +53,37 @@ class NearestMatching:
     A match to any other keypoint gives the pose nothing.
     """
 
-    def __init__(self, map: Map, options: NearestOptions) -> None:
+    def __init__(self, map: Map, options: NearestOptions, cached: int | None) -> None:
         self._options = options
-        self._targets = [reference_target(map, name) for name in map.observations]
+        names = list(map.images)
+        self._target = lru_cache(cached)(lambda row: reference_target(map, names[row]))
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:
         """Match a query's descriptors with those of an image."""
-        return match_target(query.descriptors[:strongest], self._targets[row], self._options, references=1)
+        return match_target(query.descriptors[:strongest], self._target(row), self._options, references=1)
 
     def target(self, row: int) -> Target:
         """What the image sees."""
-        return self._targets[row]
+        return self._target(row)
 
 
 class PairMatching:
     """Matches features by a network that looks at those of both images; just those that see a point."""
 
-    def __init__(self, map: Map, matcher: Matcher) -> None:
+    def __init__(self, map: Map, matcher: Matcher, cached: int | None) -> None:
         self._matcher = matcher
         self._points = [seen.points for seen in map.observations.values()]
-        self._seeing = [_seeing(map, name) for name in map.observations]
+        names = list(map.images)
+        self._seeing = lru_cache(cached)(lambda row: _seeing(map, names[row]))
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:  # noqa: ARG002
         """Match all of a query's features with those of an image."""
-        pairs = self._matcher.match(query.features, self._seeing[row])
+        pairs = self._matcher.match(query.features, self._seeing(row))
         return PointMatches(keypoints=pairs[:, 0], points=self._points[row][pairs[:, 1]], references=1)
 
     def target(self, row: int) -> Target:
         """What the image sees."""
-        return unit_rows(self._seeing[row].descriptors), self._points[row]
+        return unit_rows(self._seeing(row).descriptors), self._points[row]
 
 
 def _seeing(map: Map, name: str) -> Features:

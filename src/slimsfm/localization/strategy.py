@@ -9,7 +9,7 @@ import pycolmap
 from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import Descriptors, Ids, Image, Points2D
-from slimsfm.features import Features, NearestOptions
+from slimsfm.features import Features
 from slimsfm.pose import PoseEstimate
 
 
@@ -71,9 +71,6 @@ class MatchingOptions:
     matcher: str = "auto"
     """How the query and a reference image are matched; auto: by nearest neighbours, or without a detector
     where the map was built so."""
-
-    nearest: NearestOptions | None = None
-    """Which nearest neighbours are matches; None: what suits the map's descriptors."""
 
     retrieved: int = 2
     """Reference images that `retrieval` matches a query with."""
