@@ -19,7 +19,7 @@ from PIL import Image as PilImage
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
 from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import evaluate, prepare, queries_of
+from slimsfm.evaluation.protocol import Label, evaluate, prepare, queries_of
 from slimsfm.execution import processes
 from slimsfm.files import replacing
 from slimsfm.mapping import read_map, write_map
@@ -93,7 +93,10 @@ def main() -> None:
     parser.add_argument("-o", "--output", required=True, type=Path)
     for scene in deceptions(parser.parse_args().output):
         row = evaluate(
-            scene.references, scene.queries, (scene.name, "exhaustive", "full"), map_bytes=scene.bytes
+            scene.references,
+            scene.queries,
+            Label(object=scene.name, strategy="exhaustive", variant="full"),
+            map_bytes=scene.bytes,
         )
         print(scene.name, row.to_json())
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from benchmark_scenes import Scene, scenes
 
-from slimsfm.evaluation.protocol import evaluate
+from slimsfm.evaluation.protocol import Label, evaluate
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
 from slimsfm.mapping.io import bytes_by_part, weigh_map
@@ -143,7 +143,9 @@ def tried(
     seed: int = 0,
 ) -> Result:
     """Localize all queries of a scene."""
-    row = evaluate(map_, scene.queries, (scene.name, strategy, method), map_bytes=size)
+    row = evaluate(
+        map_, scene.queries, Label(object=scene.name, strategy=strategy, variant=method), map_bytes=size
+    )
     seconds = row.scores.seconds
     return Result(
         scene=scene.name,

@@ -5,9 +5,17 @@ import pytest
 from scenes import algorithm_1, camera, exact_map
 from slimsfm.domination import dominates
 from slimsfm.evaluation.benchmark import BenchmarkOptions, benchmark
-from slimsfm.evaluation.protocol import PreparedQuery, Query, errors_of, evaluate, localize_all, prepare
-from slimsfm.localization import STRATEGIES
+from slimsfm.evaluation.protocol import (
+    Label,
+    PreparedQuery,
+    Query,
+    errors_of,
+    evaluate,
+    localize_all,
+    prepare,
+)
 from slimsfm.reduction import ReductionOptions, keep_random_images
+from strategies import CLASSICAL
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +91,10 @@ def test_random_variants_are_the_five_seeds_and_their_row_the_mean(narrow, graph
     count = len(result.solution.chosen)
     draws = [keep_random_images(narrow, count, seed=seed) for seed in range(5)]
     assert [list(stored[f"random-{i}"].images) for i in range(5)] == [list(one.images) for one in draws]
-    found = [evaluate(one, queries, ("exact", "direct", "random"), map_bytes=1) for one in draws]
+    found = [
+        evaluate(one, queries, Label(object="exact", strategy="direct", variant="random"), map_bytes=1)
+        for one in draws
+    ]
     assert row.scores.localized == pytest.approx(sum(one.scores.localized for one in found) / 5)
     assert row.points == pytest.approx(sum(one.points for one in found) / 5)
 
@@ -98,12 +109,12 @@ def test_the_threshold_of_the_reduction_is_obeyed(narrow, graph, queries, store)
 
 def test_a_map_of_unknown_unit_has_no_centimetres(narrow, queries):
     unknown = replace(narrow, info=replace(narrow.info, unit="unknown"))
-    row = evaluate(unknown, queries, ("exact", "direct", "full"), map_bytes=1)
+    row = evaluate(unknown, queries, Label(object="exact", strategy="direct", variant="full"), map_bytes=1)
     assert row.scores.deg_cm is None
     assert row.scores.localized == 100.0
 
 
-@pytest.mark.parametrize("strategy", sorted(STRATEGIES))
+@pytest.mark.parametrize("strategy", CLASSICAL)
 def test_queries_come_back_in_order_and_no_query_is_refused(narrow, queries, strategy):
     errors = errors_of(narrow, queries, localize_all(narrow, queries, strategy))
     assert len(errors) == 10
@@ -130,7 +141,7 @@ def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
     [
         (
             {"strategies": ("direct", "guess")},
-            "strategies must be among direct, exhaustive, progressive, retrieval, got direct, guess",
+            "strategies must be among direct, exhaustive, onepose, onepose++, progressive, retrieval, got direct, guess",
         ),
         ({"strategies": ()}, "strategies must be among .* got none"),
         ({"variants": ("half",)}, "variants must be among full, dominating, default, random, got half"),

@@ -16,6 +16,8 @@ COMMANDS = {
     "localize": "poses of new images",
     "track": "poses of a video, frame by frame",
     "benchmark": "speed and accuracy, full against slim",
+    "methods": "extractors, matchers and strategies there are, and their weights",
+    "export": "a network as an ONNX file",
     "synthesize": "textured objects with exact ground truth",
     "demo": "all of it, on objects it makes itself",
 }

@@ -2,9 +2,11 @@
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, ImagesPath, OutputPath, Stopwatch, console, finish, parse, print_rows
 from slimsfm.cli.results import maps_in, print_comparison, write_results
 from slimsfm.datasets.images import hold_out, query_names
@@ -25,10 +27,13 @@ def benchmark_images(
     images: ImagesPath,
     /,
     output: OutputPath,
+    extractor: str = "sift",
+    matcher: str | None = None,
     query_every: int = 3,
     edges: Edges = "localize",
     comparison: Annotated[BenchmarkOptions, Flat] = BenchmarkOptions(),
     build: BuildOptions = BuildOptions(),
+    networks: Annotated[Networks, Flat] = Networks(),
     keep_maps: Path | None = None,
 ) -> None:
     """Measure full against slim maps on any folder of photos.
@@ -38,18 +43,26 @@ def benchmark_images(
     Args:
         images: Folder of photos.
         output: Folder for results.json and the pseudo-ground-truth model, which is reused where it exists.
+        extractor: Local features of references and queries, see `slimsfm methods`.
+        matcher: What matches images, when mapping as when localizing; by itself nearest neighbours, or what
+            the extractor asks for.
         query_every: Every n-th image in order of name, from the first, is a query; the rest are references.
         edges: How the reference graph is computed; the paper localizes each image from each other one.
         comparison: What is compared.
         build: How the pseudo ground truth is reconstructed.
+        networks: Where learned methods run.
         keep_maps: Keep the maps that are compared in this folder.
     """
     watch = Stopwatch()
+    networks.apply()
+    build = replace(build, extractor=extractor, matcher=matcher or build.matcher)
+    comparison = replace(comparison, matcher=matcher or comparison.matcher)
     query_names(list_images(images), query_every)  # refused before the long work, not after
     truth = _ground_truth(images, output / "pseudo-ground-truth", build)
     names = query_names(list(truth.images), query_every)
     references = hold_out(truth, names)
-    graph = graph_of(references, output, GraphOptions(edges=edges, candidates="all"), progress=shown).graph
+    options = GraphOptions(edges=edges, candidates="all", matcher=matcher or "auto")
+    graph = graph_of(references, output, options, progress=shown).graph
     queries = held_out_queries(truth, images, names)
     prepared = prepare(references, queries, shown)
     with tempfile.TemporaryDirectory(prefix="slimsfm-benchmark-") as temporary:

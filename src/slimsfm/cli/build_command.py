@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import (
     Flat,
     ImagesPath,
@@ -25,6 +26,7 @@ def build_photos(
     /,
     output: OutputPath,
     build: Annotated[BuildOptions, Flat] = BuildOptions(),
+    networks: Annotated[Networks, Flat] = Networks(),
     overwrite: bool = False,
 ) -> None:
     """Build a map from a folder of photos.
@@ -33,9 +35,11 @@ def build_photos(
         images: Folder of photos, with those in its subfolders.
         output: Where the map is written.
         build: How to build.
+        networks: Where learned methods run.
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
+    networks.apply()
     check_output(output, images, overwrite=overwrite)
     with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
         made = build_map(images, Path(workspace), build, progress=shown)

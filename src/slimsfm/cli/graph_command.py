@@ -9,6 +9,7 @@ import numpy as np
 import tyro
 
 from slimsfm.cli.execution import Execution, resumable
+from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, MapPath, Stopwatch, console, finish, parse
 from slimsfm.files import check_writable, replacing
 from slimsfm.graph import GraphOptions, GraphRun
@@ -24,6 +25,7 @@ def graph(
     /,
     edges: Annotated[GraphOptions, Flat] = GraphOptions(),
     execution: Annotated[Execution, Flat] = Execution(),
+    networks: Annotated[Networks, Flat] = Networks(),
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
     json: Path | None = None,
     overwrite: bool = False,
@@ -37,11 +39,13 @@ def graph(
         map: A map.
         edges: How edges are found.
         execution: Where the work is done.
+        networks: Where learned methods run.
         output: Write the graph here as well, as npz.
         json: Write the figures here.
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
+    networks.apply()
     for path in (output, json):
         if path:
             check_writable(path, overwrite=overwrite)

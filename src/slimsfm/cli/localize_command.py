@@ -8,6 +8,7 @@ from typing import Annotated
 
 import pycolmap
 
+from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import (
     Flat,
     ImagesPath,
@@ -42,6 +43,7 @@ def localize(
     output: OutputPath,
     also: tuple[Path, ...] = (),
     localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
+    networks: Annotated[Networks, Flat] = Networks(),
     camera: Path | None = None,
     gravity: Path | None = None,
     workers: int | None = None,
@@ -55,6 +57,7 @@ def localize(
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
         also: Maps of further objects to seek in the same images; then poses go to .json or .csv.
         localization: How to localize.
+        networks: Where learned methods run.
         camera: Intrinsics of the images, in COLMAP's cameras.txt format; else the map's or EXIF's.
         gravity: Where down is, as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame of
             the map and those of the images' cameras.
@@ -62,6 +65,7 @@ def localize(
         overwrite: Replace what is there.
     """
     watch = Stopwatch()
+    networks.apply()
     for source in (map, images, *also):
         check_output(output, source, overwrite=overwrite)
     writer_for(output, several=bool(also))

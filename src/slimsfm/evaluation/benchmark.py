@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from slimsfm.domination import Solution
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate
+from slimsfm.evaluation.protocol import Label, PreparedQuery, evaluate
 from slimsfm.evaluation.table import Row, mean_row
 from slimsfm.evaluation.variants import VARIANTS, Making
 from slimsfm.graph import ReferenceGraph
@@ -26,6 +26,9 @@ class BenchmarkOptions:
 
     strategies: tuple[str, ...] = ("exhaustive", "retrieval", "progressive", "direct")
     """How queries are matched."""
+
+    matcher: str = "auto"
+    """What matches a query and a reference image; auto: what suits the map."""
 
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which maps they are matched against: all of it, a dominating set of images, what `slimsfm reduce` gives
@@ -82,9 +85,9 @@ def benchmark(
         for variant, maps in stored.items():
             if strategy != "direct" and any(one.is_for_direct_matching for one, _ in maps):
                 continue
+            labelled = Label(object=name, strategy=strategy, matcher=options.matcher, variant=variant)
             draws = [
-                evaluate(one, queries, (name, strategy, variant), map_bytes=size, progress=progress)
-                for one, size in maps
+                evaluate(one, queries, labelled, map_bytes=size, progress=progress) for one, size in maps
             ]
             rows.append(mean_row(draws))
     return Benchmark(rows=tuple(rows), solution=solution)

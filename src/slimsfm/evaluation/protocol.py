@@ -12,6 +12,7 @@ from slimsfm.evaluation.metrics import PoseError, pose_error, score
 from slimsfm.evaluation.table import Row
 from slimsfm.features import Features, load_extractor
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
+from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.map import Map
 from slimsfm.photos import read_image
 from slimsfm.progress import ProgressBar, silent
@@ -78,8 +79,29 @@ def prepare(map: Map, queries: Sequence[Query], progress: ProgressBar = silent) 
     return prepared
 
 
+@dataclass(frozen=True, kw_only=True)
+class Label:
+    """What a row of a table is about."""
+
+    object: str
+    """Name of the object or scene."""
+
+    strategy: str
+    """How queries are matched."""
+
+    matcher: str = "auto"
+    """What matches a query and a reference image."""
+
+    variant: str
+    """Name of the variant that the map is."""
+
+
 def localize_all(
-    map: Map, queries: Sequence[PreparedQuery], strategy: str, progress: ProgressBar = silent
+    map: Map,
+    queries: Sequence[PreparedQuery],
+    strategy: str,
+    matcher: str = "auto",
+    progress: ProgressBar = silent,
 ) -> list[Localization]:
     """Localize queries one after the other, after one that is not timed and finds every cache cold.
 
@@ -88,13 +110,15 @@ def localize_all(
     """
     if not queries:
         raise ValueError("queries must hold at least one query")
-    localizer = Localizer(map, LocalizationOptions(strategy=strategy))
-    localizer.localize_features(queries[0].features, queries[0].query.camera)
+    options = LocalizationOptions(strategy=strategy, matching=MatchingOptions(matcher=matcher))
+    localizer = Localizer(map, options)
+    _localize(localizer, queries[0])
     return [_localize(localizer, query) for query in progress(queries, f"localize queries ({strategy})")]
 
 
 def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
-    found = localizer.localize_features(prepared.features, prepared.query.camera)
+    image = read_image(prepared.query.path) if localizer.looks_at_images else None
+    found = localizer.localize_features(prepared.features, prepared.query.camera, image=image)
     return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))
 
 
@@ -109,7 +133,7 @@ def errors_of(map: Map, queries: Sequence[PreparedQuery], found: Sequence[Locali
 def evaluate(
     map: Map,
     queries: Sequence[PreparedQuery],
-    label: tuple[str, str, str],
+    label: Label,
     *,
     map_bytes: int,
     progress: ProgressBar = silent,
@@ -119,17 +143,16 @@ def evaluate(
     Args:
         map: The map.
         queries: The queries.
-        label: Name of the object, the strategy to use, and name of the variant that the map is.
+        label: What it is about.
         map_bytes: Size of the map on disk.
         progress: Told of each query.
     """
-    name, strategy, variant = label
-    found = localize_all(map, queries, strategy, progress)
+    found = localize_all(map, queries, label.strategy, label.matcher, progress)
     errors = errors_of(map, queries, found)
     return Row(
-        object=name,
-        strategy=strategy,
-        variant=variant,
+        object=label.object,
+        strategy=label.strategy,
+        variant=label.variant,
         references=len(map.images),
         points=len(map.point3D_ids),
         map_bytes=map_bytes,

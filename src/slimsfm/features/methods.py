@@ -1,5 +1,7 @@
 """The extractors and matchers by name."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
@@ -60,13 +62,25 @@ def load_method(kind: str, registry: dict[str, str], name: str, options: dict | 
     if name not in known:
         raise InputError(f"{kind} {name!r} is unknown; known are {', '.join(sorted(known))}")
     try:
-        return resolve(known[name])(**(options or {}))
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{kind} {name!r} needs {error.name}, which is not installed: pip install 'slimsfm[learned]'"
-        ) from error
+        with importing(f"{kind} {name!r}"):
+            return resolve(known[name])(**(options or {}))
     except (TypeError, ValueError) as error:
         raise InputError(f"{kind} {name!r}: {error}") from error
+
+
+@contextmanager
+def importing(what: str) -> Iterator[None]:
+    """Say which extra to install where a package is missing.
+
+    Raises:
+        InputError: A package is missing.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{what} needs {error.name}, which is not installed: pip install 'slimsfm[learned]'"
+        ) from error
 
 
 def plugins(kind: str) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from threading import local
 from time import perf_counter
 
@@ -12,11 +11,12 @@ from jaxtyping import Shaped
 
 from slimsfm.arrays import Descriptors, Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
+from slimsfm.features.methods import DETECTOR_FREE, importing, plugins, resolve
 from slimsfm.gravity import Gravity
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.guided import extract_near
 from slimsfm.localization.search import Attempt, Found, Search
-from slimsfm.localization.strategy import MatchingOptions, Query, Strategy
+from slimsfm.localization.strategy import Cropping, MatchingOptions, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions
 
@@ -24,6 +24,8 @@ from slimsfm.pose import PoseEstimate, RansacOptions
 STRATEGIES = {
     "direct": "slimsfm.localization.direct:Direct",
     "exhaustive": "slimsfm.localization.exhaustive:Exhaustive",
+    "onepose": "slimsfm.localization.onepose:OnePose",
+    "onepose++": "slimsfm.localization.onepose_plus:OnePosePlus",
     "progressive": "slimsfm.localization.progressive:Progressive",
     "retrieval": "slimsfm.localization.retrieval:Retrieval",
 }
@@ -35,8 +37,9 @@ class LocalizationOptions:
 
     strategy: str = "auto"
     """Match against each reference image (exhaustive), those that look like the query (retrieval), one after
-    the other until the pose is sure (progressive), or against the points (direct); auto: direct where the
-    map has points chosen for it, else progressive."""
+    the other until the pose is sure (progressive), or against the points, by their descriptors (direct) or by
+    a network (onepose, onepose++); auto: direct where the map has points chosen for it, exhaustive where it
+    was built without a detector, else progressive."""
 
     matching: MatchingOptions = MatchingOptions()
     """How strategies match."""
@@ -52,10 +55,9 @@ class LocalizationOptions:
     """A pose less sure than this is not given out: the query counts as not localized."""
 
     def __post_init__(self) -> None:
-        if self.strategy not in ("auto", *STRATEGIES):
-            raise ValueError(
-                f"strategy must be auto or one of {', '.join(sorted(STRATEGIES))}, got {self.strategy!r}"
-            )
+        known = sorted({**STRATEGIES, **plugins("strategy")})
+        if self.strategy not in ("auto", *known):
+            raise ValueError(f"strategy must be auto or one of {', '.join(known)}, got {self.strategy!r}")
         if not 0 <= self.min_confidence <= 1:
             raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
 
@@ -63,7 +65,20 @@ class LocalizationOptions:
         """The strategy to use with a map."""
         if self.strategy != "auto":
             return self.strategy
+        if map.info.extractor in DETECTOR_FREE:
+            return "exhaustive"
         return "progressive" if map.point_descriptors is None else "direct"
+
+
+def load_strategy(name: str, map: Map, options: MatchingOptions = MatchingOptions()) -> Strategy:
+    """Make the strategy of this name for a map.
+
+    Raises:
+        InputError: What it needs is missing.
+        MapError: It cannot work with such a map.
+    """
+    with importing(f"strategy {name!r}"):
+        return resolve({**plugins("strategy"), **STRATEGIES}[name])(map, options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,9 +139,8 @@ class Localizer:
         self._options = options
         self.extractor = load_extractor(map.info.extractor, map.info.extractor_options)
         self._memory = local()
-        module, attribute = STRATEGIES[options.strategy_for(map)].split(":")
-        strategy: Strategy = getattr(import_module(module), attribute)(map, options.matching)
-        self._search = Search(map, strategy, options.ransac, options.focal)
+        self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
+        self._search = Search(map, self._strategy, options.ransac, options.focal)
 
     def localize(
         self, image: Image, camera: pycolmap.Camera | None = None, gravity: Gravity | None = None
@@ -175,11 +189,20 @@ class Localizer:
         seconds, query = perf_counter() - start, self._query(features, camera, image)
         return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 
+    @property
+    def looks_at_images(self) -> bool:
+        """Whether features alone are not enough: the strategy looks at queries itself."""
+        return isinstance(self._strategy, Cropping) or self.map.info.extractor in DETECTOR_FREE
+
     def localize_features(
-        self, features: Features, camera: pycolmap.Camera, gravity: Gravity | None = None
+        self,
+        features: Features,
+        camera: pycolmap.Camera,
+        gravity: Gravity | None = None,
+        image: Image | None = None,
     ) -> Localization:
-        """Localize an image by features that its map's extractor gave."""
-        query = self._query(features, camera)
+        """Localize an image by features that its map's extractor gave, and by itself where that is needed."""
+        query = self._query(features, camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), 0.0)
 
     def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[Attempt]:
