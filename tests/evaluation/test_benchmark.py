@@ -141,7 +141,7 @@ def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
     [
         (
             {"strategies": ("direct", "guess")},
-            "strategies must be among direct, exhaustive, onepose, onepose++, progressive, retrieval, got direct, guess",
+            "strategies must be among direct, exhaustive, .*, retrieval, got direct, guess",
         ),
         ({"strategies": ()}, "strategies must be among .* got none"),
         ({"variants": ("half",)}, "variants must be among full, dominating, default, random, got half"),

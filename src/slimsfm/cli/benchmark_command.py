@@ -27,8 +27,7 @@ def benchmark_images(
     images: ImagesPath,
     /,
     output: OutputPath,
-    extractor: str = "sift",
-    matcher: str | None = None,
+    extractor: str | None = None,
     query_every: int = 3,
     edges: Edges = "localize",
     comparison: Annotated[BenchmarkOptions, Flat] = BenchmarkOptions(),
@@ -44,8 +43,6 @@ def benchmark_images(
         images: Folder of photos.
         output: Folder for results.json and the pseudo-ground-truth model, which is reused where it exists.
         extractor: Local features of references and queries, see `slimsfm methods`.
-        matcher: What matches images, when mapping as when localizing; by itself nearest neighbours, or what
-            the extractor asks for.
         query_every: Every n-th image in order of name, from the first, is a query; the rest are references.
         edges: How the reference graph is computed; the paper localizes each image from each other one.
         comparison: What is compared.
@@ -55,13 +52,13 @@ def benchmark_images(
     """
     watch = Stopwatch()
     networks.apply()
-    build = replace(build, extractor=extractor, matcher=matcher or build.matcher)
-    comparison = replace(comparison, matcher=matcher or comparison.matcher)
+    matcher = None if comparison.matcher == "auto" else comparison.matcher
+    build = replace(build, extractor=extractor or build.extractor, matcher=matcher or build.matcher)
     query_names(list_images(images), query_every)  # refused before the long work, not after
     truth = _ground_truth(images, output / "pseudo-ground-truth", build)
     names = query_names(list(truth.images), query_every)
     references = hold_out(truth, names)
-    options = GraphOptions(edges=edges, candidates="all", matcher=matcher or "auto")
+    options = GraphOptions(edges=edges, candidates="all", matcher=comparison.matcher)
     graph = graph_of(references, output, options, progress=shown).graph
     queries = held_out_queries(truth, images, names)
     prepared = prepare(references, queries, shown)

@@ -28,7 +28,7 @@ class BenchmarkOptions:
     """How queries are matched."""
 
     matcher: str = "auto"
-    """What matches a query and a reference image; auto: what suits the map."""
+    """What matches images, when mapping as when localizing; auto: what suits the features."""
 
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which maps they are matched against: all of it, a dominating set of images, what `slimsfm reduce` gives

@@ -34,11 +34,8 @@ class LightGlue:
     @cached_property
     def network(self) -> Network:
         """The network with its trained weights."""
-        own = {key: value for key, value in Network.features[self._features].items() if key != "weights"}
-        made = Network(features=None, weights=None, **own)  # pyright: ignore[reportArgumentType]
-        return load_network(
-            made, f"lightglue-{self._features}", lightglue_state, derived={"confidence_thresholds"}
-        )
+        made, weights = network_for(self._features), f"lightglue-{self._features}"
+        return load_network(made, weights, lightglue_state, derived={"confidence_thresholds"})
 
     def match(self, features1: Features, features2: Features) -> IndexPairs:
         """Match two images; no feature occurs twice. Sorted by the feature of the first."""
@@ -64,6 +61,12 @@ class LightGlue:
             key: torch.from_numpy(np.ascontiguousarray(value)).to(device)[None]
             for key, value in given.items()
         }
+
+
+def network_for(features: str) -> Network:
+    """The network for features of an extractor, as long as it is without its weights."""
+    own = {key: value for key, value in Network.features[features].items() if key != "weights"}
+    return Network(features=None, weights=None, **own)  # pyright: ignore[reportArgumentType]
 
 
 def lightglue_state(checkpoint: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -30,9 +30,9 @@ class NearestOptions:
 
 SCALES = {
     "sift": NearestOptions(),
-    "aliked": NearestOptions(max_ratio=0.9, max_distance=0.8),
-    "disk": NearestOptions(max_ratio=0.9, max_distance=0.8),
-    "superpoint": NearestOptions(max_ratio=0.9, max_distance=0.8),
+    "aliked": NearestOptions(max_ratio=0.95, max_distance=0.9),
+    "disk": NearestOptions(max_ratio=0.95, max_distance=0.9),
+    "superpoint": NearestOptions(max_ratio=0.95, max_distance=0.8),
 }
 """Which neighbours match, by extractor: descriptors of different methods lie apart at different angles."""
 

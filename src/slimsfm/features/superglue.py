@@ -57,7 +57,7 @@ class SuperGlue:
 
     def scores(
         self, features1: Features, features2: Features, device: torch.device
-    ) -> Float[Tensor, "1 n+1 m+1"]:
+    ) -> Float[Tensor, "1 rows columns"]:
         """Logarithms of the probabilities of all matches; the last row and column say that there is none."""
         one, other = (self._encoded(features, device) for features in (features1, features2))
         gnn = self.network.gnn

@@ -104,7 +104,14 @@ class _Ignored(dict):
     def __init__(self, *_args: object, **_kwargs: object) -> None:
         super().__init__()
 
+    def __call__(self, *_args: object, **_kwargs: object) -> "_Ignored":
+        return self
+
     def __setstate__(self, _state: object) -> None: ...
+
+    def append(self, _item: object) -> None: ...
+
+    def extend(self, _items: object) -> None: ...
 
 
 class _Unpickler(pickle.Unpickler):

@@ -1,0 +1,53 @@
+"""Write weight files of the published names and layouts, filled with seeded random numbers.
+
+They show that methods run, how long they take and what a map's reduction gains; what they compute means
+nothing, so no accuracy can be claimed. ALIKED is left out: its files are known by their checksums.
+
+    python benchmarks/random_weights.py -o WEIGHTS
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from kornia.feature import DISK
+from torch import nn
+from transformers import (
+    SuperGlueConfig,
+    SuperGlueForKeypointMatching,
+    SuperPointConfig,
+    SuperPointForKeypointDetection,
+)
+
+from slimsfm.features import lightglue
+
+
+def write_random_weights(folder: Path, seed: int = 0) -> Path:
+    """Write a file for every method but ALIKED."""
+    torch.manual_seed(seed)
+    superglue = SuperGlueForKeypointMatching(SuperGlueConfig())
+    states = {
+        "depth-save.pth": {"extractor": _state(DISK())},
+        "superpoint_v1.pth": _state(SuperPointForKeypointDetection(SuperPointConfig())),
+        "superglue_outdoor.pth": _state(superglue),
+        **{f"{name}_lightglue.pth": _state(lightglue.network_for(name)) for name in lightglue.KNOWN},
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, state in states.items():
+        torch.save(state, folder / file)
+    return folder
+
+
+def _state(network: nn.Module) -> dict:
+    return network.state_dict()
+
+
+def main() -> None:
+    """Write the files."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("-o", "--output", required=True, type=Path)
+    print(write_random_weights(parser.parse_args().output))
+
+
+if __name__ == "__main__":
+    main()
