@@ -31,20 +31,24 @@ def extract_features(
     Raises:
         InputError: An image cannot be read, or its mask is missing or of another size.
     """
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"{masks}: no such folder of masks")
     colors = {}
     with FeatureWriter(output) as writer:
         for name in progress(names, "extract features"):
             image = read_image(images / name)
-            features = extractor.extract(image, _read_mask(masks, name, image.shape[:2]))
+            features = extractor.extract(image, mask_of(masks, name, image.shape[:2]))
             colors[name] = image_colors(image, features.keypoints)
             writer.write(name, features)
     return FeatureFile(output), colors
 
 
-def _read_mask(masks: Path | None, name: str, shape: tuple[int, ...]) -> GrayImage | None:
-    """The mask of an image as COLMAP names it; an image without one is used whole, as COLMAP does."""
+def mask_of(masks: Path | None, name: str, shape: tuple[int, ...]) -> GrayImage | None:
+    """The mask of an image as COLMAP names it; an image without one is used whole, as COLMAP does.
+
+    Raises:
+        InputError: There is no such folder, or the mask cannot be read or is of another size.
+    """
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"{masks}: no such folder of masks")
     path = masks / f"{name}.png" if masks else None
     if path is None or not path.exists():
         return None
