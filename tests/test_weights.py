@@ -51,7 +51,7 @@ def test_research_only_weights_say_so_once(caplog):
         for name in ("superpoint", "superpoint", "disk"):
             remind_of_licence(name)
     assert [record.getMessage() for record in caplog.records] == [
-        "superpoint_v1.pth: Magic Leap's research licence: no commercial use"
+        "superpoint_v1.pth: its licence (Magic Leap) allows research only, no commercial use"
     ]
 
 

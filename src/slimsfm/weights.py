@@ -17,7 +17,7 @@ from slimsfm.errors import InputError
 FOLDER = "SLIMSFM_WEIGHTS"
 """Environment variable that names the folder of weight files."""
 
-_RESEARCH = "Magic Leap's research licence: no commercial use"
+_RESEARCH = "Magic Leap: research only"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,4 +178,6 @@ def missing(weights: WeightFile) -> InputError:
 def remind_of_licence(name: str) -> None:
     """Say once that weights are for research only, where they are."""
     if WEIGHTS[name].is_research_only:
-        logging.getLogger("slimsfm").warning("%s: %s", WEIGHTS[name].file, WEIGHTS[name].licence)
+        logging.getLogger("slimsfm").warning(
+            "%s: its licence (Magic Leap) allows research only, no commercial use", WEIGHTS[name].file
+        )

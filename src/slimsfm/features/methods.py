@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
@@ -23,6 +24,12 @@ MATCHERS = {
     "nearest": "slimsfm.features.nearest:Nearest",
     "superglue": "slimsfm.features.superglue:SuperGlue",
 }
+
+_GROUPS = {
+    "extractor": "slimsfm.extractors",
+    "matcher": "slimsfm.matchers",
+    "strategy": "slimsfm.strategies",
+}  # entry points, by which installed packages offer methods of their own
 
 DETECTOR_FREE = {"loftr"}
 """Extractors that find no keypoints: images are matched as wholes."""
@@ -50,7 +57,7 @@ def load_method(kind: str, registry: dict[str, str], name: str, options: dict | 
     """Make the method of this name, one of ours or a plug-in's.
 
     Args:
-        kind: What it is, in a word; plug-ins offer theirs in the entry-point group `slimsfm.KINDs`.
+        kind: extractor, matcher or strategy.
         registry: Our methods' import paths by name.
         name: The method's name.
         options: Its options.
@@ -83,9 +90,10 @@ def importing(what: str) -> Iterator[None]:
         ) from error
 
 
+@cache
 def plugins(kind: str) -> dict[str, str]:
     """Import paths of what installed packages offer, by name."""
-    return {found.name: found.value for found in entry_points(group=f"slimsfm.{kind}s")}
+    return {found.name: found.value for found in entry_points(group=_GROUPS[kind])}
 
 
 def resolve(path: str) -> Any:
