@@ -128,8 +128,8 @@ def _found(method: _Method, name: str) -> str:
         return installed
     try:
         return "yes" if find_weights(name) else "not in the folder"
-    except InputError as error:
-        return str(error)
+    except InputError:
+        return "no: another file of that name"
 
 
 def main(arguments: Sequence[str]) -> None:
