@@ -17,7 +17,7 @@ def fill(module: nn.Module, seed: int) -> None:
         for key, value in sorted(module.state_dict().items()):
             if value.is_floating_point():
                 drawn = _draw(key, tuple(value.shape), generator)
-                value.copy_(torch.from_numpy(drawn.astype(np.float32)).reshape(value.shape))
+                value.copy_(torch.from_numpy(np.asarray(drawn, np.float32)))
 
 
 def _draw(key: str, shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:

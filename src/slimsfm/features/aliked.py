@@ -15,8 +15,10 @@ from kornia.feature import ALIKED
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
 from slimsfm.features.learned import check_sizes, features_of, network_input
+from slimsfm.networks.aliked import AlikedMaps, dense_maps
 from slimsfm.networks.devices import choose_device, inference
 from slimsfm.networks.loading import load_network
+from slimsfm.networks.onnx import Exportable, onnx_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,10 +60,29 @@ class Aliked:
         made = ALIKED(self.model, self.max_features, self.threshold)
         return load_network(made, self.model, derived={"dkd.hw_grid"})
 
+    @cached_property
+    def maps(self) -> AlikedMaps:
+        """What of the network sees the image."""
+        return AlikedMaps(self.network)
+
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
         """Find features; none where the mask, of the image's size, is 0."""
         taken = network_input(image, self.max_image_size, choose_device())
         with torch.inference_mode(), inference(taken.pixels.device):
-            found = self.network(taken.pixels)[0]
-        parts = found.keypoints, found.descriptors, found.keypoint_scores
-        return features_of(taken, *parts, mask, self.max_features)
+            seen = dense_maps(onnx_run(self.model) or self.maps, taken.pixels)
+            places, strengths, _ = self.network.dkd(seen.scores)
+            descriptors, _ = self.network.desc_head(seen.features, places)
+        height, width = taken.pixels.shape[2:]
+        far = taken.pixels.new_tensor([width - 1, height - 1])
+        keypoints = far * (places[0] + 1) / 2  # from -1 to 1, corner pixel to corner pixel
+        return features_of(taken, keypoints, descriptors[0], strengths[0], mask, self.max_features)
+
+
+def exportable(method: str) -> Exportable:
+    """What an ONNX file holds: image in, scores of pixels and four maps of features out; sides by 32."""
+    return Exportable(
+        network=Aliked(model=method).maps.cpu(),
+        inputs={"image": torch.zeros(1, 3, 96, 128)},
+        dynamic={"image": (2, 3)},
+        outputs=("scores", "features1", "features2", "features3", "features4"),
+    )

@@ -1,6 +1,7 @@
 """What stands for an extractor where images are matched as wholes."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -15,6 +16,9 @@ class DetectorFree:
     max_image_size: int = 640
     """Longer side in pixels to which images are shrunk before they are matched."""
 
+    weights: Literal["loftr", "loftr-onepose++"] = "loftr"
+    """What matches them: LoFTR's own, or those by which OnePose++ builds its maps and which it needs."""
+
     @property
     def name(self) -> str:
         """The name under which a map remembers its extractor."""
@@ -23,7 +27,7 @@ class DetectorFree:
     @property
     def options(self) -> dict:
         """What `load_extractor` needs to make an equal extractor."""
-        return {"max_image_size": self.max_image_size}
+        return asdict(self)
 
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:  # noqa: ARG002
         """No features, of an image of this size."""

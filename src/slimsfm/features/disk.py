@@ -8,13 +8,19 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from kornia.feature import DISK
+from kornia.feature.disk.detector import heatmap_to_keypoints
+from torch import Tensor, nn
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
 from slimsfm.features.learned import check_sizes, features_of, network_input
 from slimsfm.networks.devices import choose_device, inference
 from slimsfm.networks.loading import load_network
+from slimsfm.networks.onnx import Exportable, onnx_run
+
+_STEP = 16  # pixels: what the sides of what the network sees must be multiples of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +54,31 @@ class Disk:
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
         """Find features; none where the mask, of the image's size, is 0."""
         taken = network_input(image, self.max_image_size, choose_device())
+        height, width = taken.pixels.shape[2:]
+        padded = F.pad(taken.pixels, (0, -width % _STEP, 0, -height % _STEP))
         count = self.max_features if mask is None else None
-        with torch.inference_mode(), inference(taken.pixels.device):
-            found = self.network(taken.pixels, count, pad_if_not_divisible=True)[0]
+        with torch.inference_mode(), inference(padded.device):
+            maps = (onnx_run("disk") or self.network.heatmap_and_dense_descriptors)(padded)
+            heatmap, descriptors = (one[..., :height, :width] for one in maps)
+            found = heatmap_to_keypoints(heatmap, count)[0].merge_with_descriptors(descriptors[0])
         parts = found.keypoints.to(torch.float32), found.descriptors, found.detection_scores
         return features_of(taken, *parts, mask, self.max_features)
+
+
+def exportable(_method: str) -> Exportable:
+    """What an ONNX file holds: image in, scores and descriptors of pixels out; sides by 16."""
+    return Exportable(
+        network=_Maps(Disk().network.cpu()),
+        inputs={"image": torch.zeros(1, 3, 96, 128)},
+        dynamic={"image": (2, 3)},
+        outputs=("scores", "descriptors"),
+    )
+
+
+class _Maps(nn.Module):
+    def __init__(self, network: DISK) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        return self.network.heatmap_and_dense_descriptors(image)

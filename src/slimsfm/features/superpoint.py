@@ -18,6 +18,8 @@ from slimsfm.features.base import Features
 from slimsfm.features.learned import check_sizes, features_of, network_input
 from slimsfm.networks.devices import choose_device, inference
 from slimsfm.networks.loading import load_network
+from slimsfm.networks.onnx import Exportable, onnx_run
+from slimsfm.networks.superpoint import SuperPointMaps, describe_pixels, strongest_pixels
 
 _GRAY = (0.299, 0.587, 0.114)  # weights of red, green and blue
 
@@ -65,22 +67,30 @@ class SuperPoint:
         return asdict(self)
 
     @cached_property
-    def network(self) -> SuperPointForKeypointDetection:
-        """The network with its trained weights."""
-        config = SuperPointConfig(
-            keypoint_threshold=self.threshold, nms_radius=self.nms_radius, border_removal_distance=4
-        )
-        return load_network(SuperPointForKeypointDetection(config), "superpoint", superpoint_state)
+    def maps(self) -> SuperPointMaps:
+        """What of the network sees the image, with its trained weights."""
+        made = SuperPointForKeypointDetection(SuperPointConfig())
+        return SuperPointMaps(load_network(made, "superpoint", superpoint_state))
 
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
         """Find features; none where the mask, of the image's size, is 0."""
         taken = network_input(image, self.max_image_size, choose_device())
         gray = torch.einsum("bchw,c->bhw", taken.pixels, taken.pixels.new_tensor(_GRAY))[:, None]
         with torch.inference_mode(), inference(gray.device):
-            found = self.network(gray.expand(-1, 3, -1, -1))
-        height, width = gray.shape[2:]
-        keypoints = found.keypoints[0].to(torch.float32) * gray.new_tensor([width, height])
-        return features_of(taken, keypoints, found.descriptors[0], found.scores[0], mask, self.max_features)
+            scores, descriptors = (onnx_run("superpoint") or self.maps)(gray)
+            pixels, strengths = strongest_pixels(scores, self.nms_radius, self.threshold)
+            described = describe_pixels(descriptors, pixels)
+        return features_of(taken, pixels.to(torch.float32), described, strengths, mask, self.max_features)
+
+
+def exportable(_method: str) -> Exportable:
+    """What an ONNX file holds: gray image in, scores of pixels and descriptors of cells out."""
+    return Exportable(
+        network=SuperPoint().maps.cpu(),
+        inputs={"gray": torch.zeros(1, 1, 96, 128)},
+        dynamic={"gray": (2, 3)},
+        outputs=("scores", "descriptors"),
+    )
 
 
 def superpoint_state(checkpoint: Mapping[str, Tensor]) -> dict[str, Tensor]:

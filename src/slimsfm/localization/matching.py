@@ -24,6 +24,10 @@ class ReferenceMatching(Protocol):
         """What the image sees."""
         ...
 
+    def describe(self, query: Query) -> Descriptors:
+        """What a query looks like, in terms of what the images are described by; at most 2048 rows count."""
+        ...
+
 
 def matching_with(map: Map, options: MatchingOptions, cached: int | None = None) -> ReferenceMatching:
     """The way of matching that the options ask for.
@@ -66,6 +70,10 @@ class NearestMatching:
         """What the image sees."""
         return self._target(row)
 
+    def describe(self, query: Query) -> Descriptors:
+        """The query's own descriptors."""
+        return query.descriptors
+
 
 class PairMatching:
     """Matches features by a network that looks at those of both images; just those that see a point."""
@@ -84,6 +92,10 @@ class PairMatching:
     def target(self, row: int) -> Target:
         """What the image sees."""
         return unit_rows(self._seeing(row).descriptors), self._points[row]
+
+    def describe(self, query: Query) -> Descriptors:
+        """The query's own descriptors."""
+        return query.descriptors
 
 
 def _seeing(map: Map, name: str) -> Features:

@@ -39,7 +39,7 @@ class Progressive:
         parts = [match_target(query.descriptors[:_FIRST], self._landmarks, self._nearest)]
         matches = unite(parts)
         pose = yield matches
-        similarities, tried = self._ranking.similarities(query), []
+        similarities, tried = self._ranking.similarities(self._references.describe(query)), []
         while len(tried) < _TRIED * len(self._references):
             agreeing = matches.points[pose.inliers] if pose else matches.points
             for _ in range(max(1, round(_GROWTH * len(tried)))):

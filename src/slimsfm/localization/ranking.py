@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float32
 
+from slimsfm.arrays import Descriptors
 from slimsfm.features.vlad import vlad
-from slimsfm.localization.strategy import Query
 from slimsfm.mapping.appearance import describe_images
 from slimsfm.mapping.map import Map
 
@@ -17,6 +17,10 @@ class Ranking:
     def __init__(self, map: Map) -> None:
         self._appearance = map.appearance or describe_images(map)
 
-    def similarities(self, query: Query) -> Float32[np.ndarray, " references"]:
-        """Cosine between the query's global descriptor and that of each reference image, in order of name."""
-        return self._appearance.rows @ vlad(query.descriptors[:_STRONGEST], self._appearance.words)
+    def similarities(self, descriptors: Descriptors) -> Float32[np.ndarray, " references"]:
+        """Cosine between a query's global descriptor and that of each reference image, in order of name.
+
+        Args:
+            descriptors: What the query looks like, the strongest keypoints first.
+        """
+        return self._appearance.rows @ vlad(descriptors[:_STRONGEST], self._appearance.words)

@@ -7,6 +7,7 @@ import pycolmap
 from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
+from slimsfm.arrays import Descriptors
 from slimsfm.localization.matching import ReferenceMatching, matching_with
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target, unite
 from slimsfm.mapping.map import Map, check_has_features, observed
@@ -49,6 +50,10 @@ class References:
         """
         chosen = range(len(self)) if rows is None else rows
         return unite([self._matching.match(query, row, strongest) for row in chosen])
+
+    def describe(self, query: Query) -> Descriptors:
+        """What a query looks like, in terms of what the images are described by."""
+        return self._matching.describe(query)
 
     def sharing(self, points: Int64[np.ndarray, " _"]) -> Float32[np.ndarray, " references"]:
         """How many of some points each image sees."""

@@ -25,7 +25,7 @@ class Retrieval:
 
     def rounds(self, query: Query) -> Rounds:
         """Match the query with the images that resemble it, in one round."""
-        order = np.argsort(-self._ranking.similarities(query), kind="stable")
+        order = np.argsort(-self._ranking.similarities(self._references.describe(query)), kind="stable")
         yield self._references.match(query, order[: self._retrieved].tolist())
 
     def expected(

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from slimsfm.arrays import Descriptors, Ids, Image, Points2D
 from slimsfm.features import Features
@@ -46,7 +46,7 @@ class PointMatches:
     references: int = 0
     """Reference images that the query was matched with to find them."""
 
-    points2D: Points2D | None = None
+    points2D: Float64[np.ndarray, "_ 2"] | None = None
     """Pixels of keypoints that a strategy found itself; None where they are the query's."""
 
     def pixels(self, query: Query) -> Points2D:
@@ -79,6 +79,8 @@ class MatchingOptions:
         if self.retrieved < 1:
             raise ValueError(f"retrieved must be at least 1, got {self.retrieved}")
 
+
+_SAME_PX = 4.0  # side of a square in which places of one point, each told by another image, are one
 
 Target = tuple[Float32[np.ndarray, "_ d"], Int64[np.ndarray, " _"]]
 """Descriptors to match a query with, and the point of each, a row of the map's points."""
@@ -121,16 +123,32 @@ class Cropping(Protocol):
 
 
 def unite(parts: Sequence[PointMatches]) -> PointMatches:
-    """Join matches from several sources; equal ones become one. Sorted by keypoint, then point."""
+    """Join matches from several sources; equal ones become one. Sorted by keypoint, then point.
+
+    What strategies found themselves is equal where a point is found at the same place, to a pixel or two, by
+    several sources: one match is left, at the mean of the places, so that nobody counts it twice.
+    """
     keypoints = np.concatenate([np.zeros(0, np.int64), *_numbered_through(parts)])
     points = np.concatenate([np.zeros(0, np.int64), *(part.points for part in parts)])
     _, first = np.unique((keypoints << 32) | points, return_index=True)
     found = [part.points2D for part in parts if part.points2D is not None]
+    references = sum(part.references for part in parts)
+    if found:
+        return _merged(np.concatenate(found)[keypoints[first]], points[first], references)
+    return PointMatches(keypoints=keypoints[first], points=points[first], references=references)
+
+
+def _merged(points2D: Points2D, points: Ids, references: int) -> PointMatches:
+    """Matches of keypoints that strategies found themselves; each place of a point is one of its own."""
+    places = np.column_stack([points, np.round(points2D / _SAME_PX).astype(np.int64)])
+    unique, which, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(unique), 2))
+    np.add.at(sums, which.ravel(), points2D)
     return PointMatches(
-        keypoints=keypoints[first],
-        points=points[first],
-        references=sum(part.references for part in parts),
-        points2D=np.concatenate(found) if found else None,
+        keypoints=np.arange(len(unique)),
+        points=unique[:, 0],
+        references=references,
+        points2D=sums / counts[:, None],
     )
 
 

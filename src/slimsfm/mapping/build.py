@@ -1,25 +1,40 @@
 """Photos to map."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import pycolmap
 
 from slimsfm.errors import InputError
-from slimsfm.features import Extractor, load_extractor, load_matcher
+from slimsfm.features import Extractor, Features, load_extractor, load_matcher
+from slimsfm.features.image_matching import Photo, load_image_matcher
+from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.appearance import with_appearance
 from slimsfm.mapping.box import estimate_box, read_box
+from slimsfm.mapping.build_keypoint_free import PhotoFolder, build_without_keypoints
 from slimsfm.mapping.cameras import CameraSharing, guess_cameras
+from slimsfm.mapping.cell_keypoints import Matches
 from slimsfm.mapping.extraction import color_points, extract_features
+from slimsfm.mapping.image_pairs import choose_image_pairs
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.pair_matching import match_pairs_with, verify_pairs
 from slimsfm.mapping.pairs import PairChoice, choose_pairs
-from slimsfm.mapping.sfm import match_pairs, reconstruct, triangulate, verified_matches, write_database
+from slimsfm.mapping.photo_file import shrink_photo
+from slimsfm.mapping.sfm import (
+    match_pairs,
+    put_keypoints,
+    reconstruct,
+    triangulate,
+    verified_matches,
+    write_database,
+)
 from slimsfm.photos import list_images
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.weights import find_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +46,8 @@ class BuildOptions:
 
     pairs: PairChoice = "auto"
     """Images to match: each with every other one, with its neighbours in order of name, or with those that
-    look alike. Auto: exhaustive up to 200 images, above that sequential and similar."""
+    look alike. Auto: exhaustive up to 200 images, above that sequential and similar; without a detector
+    exhaustive up to 30, above that by pose where poses are known, else sequential."""
 
     masks: Path | None = None
     """Folder of masks, NAME.png for image NAME (COLMAP's convention): no features where they are black."""
@@ -115,25 +131,20 @@ def build_map(
     extractor = _extractor(options)
     workspace.mkdir(parents=True, exist_ok=True)
     cameras = known.cameras if known else guess_cameras(images, names, options.camera)
-    features, colors = extract_features(
-        images, names, extractor, options.masks, workspace / "features.h5", progress
-    )
-    database = _match(workspace, features, cameras, options, progress)
-    if known:
-        model = triangulate(database, names, workspace / "sfm", known.cam_from_world, seed=options.seed)
-    else:
-        model = reconstruct(database, names, workspace / "sfm", seed=options.seed)
-    color_points(model, colors)
+    work = _Work(images, names, workspace, cameras, known, progress)
+    make_parts = _parts_without_keypoints if extractor.name in DETECTOR_FREE else _parts_with_keypoints
+    parts = make_parts(work, extractor, options)
     info = MapInfo(
         extractor=extractor.name,
         extractor_options=extractor.options,
-        box=given_box or estimate_box(model),
+        box=given_box or estimate_box(parts.model),
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
     )
-    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    made = Map(model=model, features=features, matches=matches, info=info)
+    made = Map(
+        model=parts.model, features=parts.features, matches=parts.matches, photos=parts.photos, info=info
+    )
     return _build(with_appearance(made), names)
 
 
@@ -141,28 +152,78 @@ def _build(map: Map, names: list[str]) -> Build:
     return Build(map=map, left_out=tuple(name for name in names if name not in map.images))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Parts:
+    """What images become."""
+
+    model: pycolmap.Reconstruction
+    features: Mapping[str, Features]
+    matches: Matches
+    photos: Mapping[str, Photo] = field(default_factory=dict)
+
+
+class _Work(NamedTuple):
+    """What both ways of building need."""
+
+    images: Path
+    names: list[str]
+    workspace: Path
+    cameras: Mapping[str, pycolmap.Camera]
+    known: KnownPoses | None
+    progress: ProgressBar
+
+
+def _parts_with_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
+    output, names = work.workspace / "features.h5", work.names
+    features, colors = extract_features(work.images, names, extractor, options.masks, output, work.progress)
+    database = _match(work, features, options)
+    if work.known:
+        poses = work.known.cam_from_world
+        model = triangulate(database, names, work.workspace / "sfm", poses, seed=options.seed)
+    else:
+        model = reconstruct(database, names, work.workspace / "sfm", seed=options.seed)
+    put_keypoints(model, features)
+    color_points(model, colors)
+    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
+    return _Parts(model=model, features=features, matches=matches)
+
+
+def _parts_without_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
+    photos = PhotoFolder(work.images, work.names)
+    poses = work.known.cam_from_world if work.known else None
+    made = build_without_keypoints(
+        photos,
+        choose_image_pairs(work.names, options.pairs, poses),
+        load_image_matcher(extractor.name, extractor.options),
+        work.cameras,
+        work.workspace,
+        cam_from_world=poses,
+        masks=options.masks,
+        seed=options.seed,
+        progress=work.progress,
+    )
+    limit = extractor.options["max_image_size"]
+    small = {name: shrink_photo(photos[name], limit) for name in made.features}
+    return _Parts(model=made.model, features=made.features, matches=made.matches, photos=small)
+
+
 def _extractor(options: BuildOptions) -> Extractor:
-    wishes = {"max_features": options.max_features, "max_image_size": options.max_image_size}
+    wishes: dict = {"max_features": options.max_features, "max_image_size": options.max_image_size}
+    if options.extractor in DETECTOR_FREE and find_weights("loftr-onepose++"):
+        wishes["weights"] = "loftr-onepose++"  # the map then serves OnePose++ as well
     return load_extractor(
         options.extractor, {key: value for key, value in wishes.items() if value is not None}
     )
 
 
-def _match(
-    workspace: Path,
-    features: FeatureFile,
-    cameras: Mapping[str, pycolmap.Camera],
-    options: BuildOptions,
-    progress: ProgressBar,
-) -> Path:
-    database = workspace / "database.db"
-    write_database(database, features, cameras)
+def _match(work: _Work, features: FeatureFile, options: BuildOptions) -> Path:
+    database = work.workspace / "database.db"
+    write_database(database, features, work.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
-        match_pairs(database, names, pairs, seed=options.seed, progress=progress)
+        match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)
     else:
-        matches = match_pairs_with(
-            load_matcher(options.matcher, options.extractor), features, pairs, progress
-        )
+        matcher = load_matcher(options.matcher, options.extractor)
+        matches = match_pairs_with(matcher, features, pairs, work.progress)
         verify_pairs(database, names, matches, seed=options.seed)
     return database

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import h5py
 import numpy as np
+from jaxtyping import UInt8
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError
@@ -65,7 +66,7 @@ def _jpeg(photo: Image) -> np.ndarray:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].ravel()
 
 
-def shrink_photo(photo: Image, max_image_size: int) -> Image:
+def shrink_photo(photo: Image, max_image_size: int) -> UInt8[np.ndarray, "h w 3"]:
     """Shrink a photo, unless it is small, so that its longer side has so many pixels; as it is read back."""
     height, width = photo.shape[:2]
     scale = min(1.0, max_image_size / max(height, width))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float32
 from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import IndexPairs
@@ -13,6 +14,7 @@ from slimsfm.features import Features
 from slimsfm.mapping.pairs import Pairs
 from slimsfm.progress import ProgressBar, silent
 
+_JITTER_PX, _ON_GRID = 0.05, 1e-3  # pixels
 _BLOCK = 200  # pairs matched between two steps of the progress bar
 
 
@@ -42,12 +44,31 @@ def write_database(
 
 
 def _write_features(database: pycolmap.Database, image_id: int, features: Features) -> None:
-    database.write_keypoints(image_id, features.keypoints.astype(np.float32))
+    database.write_keypoints(image_id, _off_grid(features.keypoints))
     if features.descriptors.dtype == np.uint8:
         descriptors = pycolmap.FeatureDescriptors(
             type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors
         )
         database.write_descriptors(image_id, descriptors)
+
+
+def _off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
+    """Keypoints moved by up to a twentieth of a pixel if all lie on a grid of half pixels.
+
+    On an exact grid COLMAP's solver for cameras of unknown focal length may crash the process.
+    """
+    if np.any(np.abs(2 * keypoints - np.round(2 * keypoints)) > _ON_GRID):
+        return keypoints
+    jitter = np.random.default_rng(len(keypoints)).uniform(-_JITTER_PX, _JITTER_PX, keypoints.shape)
+    return keypoints + jitter.astype(np.float32)
+
+
+def put_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Features]) -> None:
+    """Give the images of a model the very keypoints of their features."""
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        for point, xy in zip(image.points2D, features[image.name].keypoints, strict=True):
+            point.xy = xy.astype(np.float64)
 
 
 def match_pairs(
