@@ -232,7 +232,7 @@ def test_the_object_is_found_by_photos_of_any_size(plain, step):
     assert found.region is not None
     assert shown is not None
     np.testing.assert_allclose(found.region.corners, shown.corners, atol=25)
-    assert found.photos <= 6
+    assert found.references <= 6
 
 
 def test_a_map_of_keypoints_and_missing_weights_are_told_of(exact, plain, monkeypatch, tmp_path):

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from slimsfm.arrays import Ids, Image, Points2D
+from slimsfm.arrays import Image
 from slimsfm.errors import MapError
 from slimsfm.features.image_matching import EncodedImage, ImageMatcher
 from slimsfm.features.loftr import Loftr
@@ -28,11 +28,11 @@ from slimsfm.localization.crop import (
     SIZE,
     Region,
     Sighting,
-    best_region,
     crop_region,
     region_by_matches,
     region_of_box,
 )
+from slimsfm.localization.look import Finding, Look, find, spread
 from slimsfm.localization.onepose_points import OnePosePoints, OnePosePointsOptions, prepare_points
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target
 from slimsfm.mapping.map import Map, check_has_features
@@ -42,8 +42,6 @@ from slimsfm.networks.onepose_plus import OnePosePlusMatcher, state_of
 
 _POINTS = OnePosePointsOptions(max_points=15000, leaves=0)  # as by the authors
 _COARSE, _FINE = 256, 128  # numbers of which a descriptor is made up
-_REFERENCES = 15  # photos that are asked where the object is, as by the authors
-_SURE = 60  # matches that agree on it: no further photo is asked
 _ALL = Region(left=0.0, top=0.0, right=1.0, bottom=1.0)  # of an image, as shares of its width and height
 _CELL_PX = 8.0  # side of a cell for which what `region_by_matches` tolerates is right
 
@@ -78,13 +76,13 @@ class OnePosePlus:
         whole = _scaled(_ALL, query.camera.width, query.camera.height)
         found = self._finder.find(query.image) if self._finder else Finding(None, 0)
         first = self._look(query.image, found.region or whole)
-        pose = yield first.matches(found.photos)
+        pose = yield first.matches(found.references)
         if pose is not None:
             region = region_of_box(self._box, pose.cam_from_world, query.camera)
         else:
             region = whole if found.region else None
         if region is not None:
-            yield self._look(query.image, region).added_to(first).matches(found.photos)
+            yield self._look(query.image, region).added_to(first).matches(found.references)
 
     def near(self, query: Query, near_cam_from_world: pycolmap.Rigid3d) -> PointMatches:
         """Look where a pose puts the box."""
@@ -117,43 +115,12 @@ class OnePosePlus:
         return Look(points[inside], points2D[inside])
 
 
-class Look(NamedTuple):
-    """What the network finds in an image; no point occurs twice."""
-
-    points: Ids
-    """Rows of the map's points."""
-
-    points2D: Points2D
-    """For each of them its pixels."""
-
-    def added_to(self, before: "Look") -> "Look":
-        """What is found now, and what was found before of points that are not found again."""
-        rest = ~np.isin(before.points, self.points)
-        parts = zip(self, (column[rest] for column in before), strict=True)
-        return Look(*(np.concatenate(part) for part in parts))
-
-    def matches(self, references: int = 0) -> PointMatches:
-        """The same as matches, each with a keypoint of its own."""
-        rows = np.arange(len(self.points), dtype=np.int64)
-        return PointMatches(keypoints=rows, points=self.points, references=references, points2D=self.points2D)
-
-
 class DescribedPoints(NamedTuple):
     """The points as the network takes them, where it runs."""
 
     points3D: Float[Tensor, "1 m 3"]
     coarse_descriptors: Float[Tensor, "1 256 m"]
     fine_descriptors: Float[Tensor, "1 128 m"]
-
-
-class Finding(NamedTuple):
-    """Where the object is."""
-
-    region: Region | None
-    """The part of the query that shows it, if any photo tells."""
-
-    photos: int
-    """Photos that were asked."""
 
 
 class ObjectFinder:
@@ -163,8 +130,7 @@ class ObjectFinder:
         seen = {name: _region_in_photo(map, name) for name in map.images if name in map.photos}
         regions = {name: region for name, region in seen.items() if region is not None}
         names = sorted(regions)
-        rows = np.linspace(0, len(names) - 1, min(_REFERENCES, len(names))).round().astype(int)
-        self._regions = {names[row]: regions[names[row]] for row in rows}
+        self._regions = {names[row]: regions[names[row]] for row in spread(len(names))}
         self._photos: Mapping[str, Image] = map.photos
         self._matcher = matcher
         self._encoded: dict[str, EncodedImage] = {}
@@ -172,12 +138,7 @@ class ObjectFinder:
     def find(self, image: Image) -> Finding:
         """Find the object: where most matches with a photo agree, of photos until one is sure."""
         query = self._matcher.encode(image, cells_only=True)
-        sightings: list[Sighting | None] = []
-        for name in self._regions:
-            sightings.append(self._sighting(query, name))
-            if sightings[-1] is not None and sightings[-1].inliers >= _SURE:
-                break
-        return Finding(best_region(sightings), len(sightings))
+        return find(self._sighting(query, name) for name in self._regions)
 
     def _sighting(self, query: EncodedImage, name: str) -> Sighting | None:
         """Where a photo says that the object is.
