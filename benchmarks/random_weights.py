@@ -20,6 +20,9 @@ from transformers import (
 )
 
 from slimsfm.features import lightglue
+from slimsfm.networks.loftr import make_network
+from slimsfm.networks.onepose import GraphAttentionMatcher
+from slimsfm.networks.onepose_plus import OnePosePlusMatcher
 
 
 def write_random_weights(folder: Path, seed: int = 0) -> Path:
@@ -31,6 +34,10 @@ def write_random_weights(folder: Path, seed: int = 0) -> Path:
         "superpoint_v1.pth": _state(SuperPointForKeypointDetection(SuperPointConfig())),
         "superglue_outdoor.pth": _state(superglue),
         **{f"{name}_lightglue.pth": _state(lightglue.network_for(name)) for name in lightglue.KNOWN},
+        "loftr_outdoor.ckpt": {"state_dict": _state(make_network(window=5, coarse_context=True), "matcher.")},
+        "LoFTR_wsize9.ckpt": {"state_dict": _state(make_network(window=9, coarse_context=False), "matcher.")},
+        "GATsSPG.ckpt": {"state_dict": _state(GraphAttentionMatcher(), "matcher.")},
+        "OnePosePlus_model.ckpt": {"state_dict": _state(OnePosePlusMatcher(), "matcher.")},
     }
     folder.mkdir(parents=True, exist_ok=True)
     for file, state in states.items():
@@ -38,8 +45,8 @@ def write_random_weights(folder: Path, seed: int = 0) -> Path:
     return folder
 
 
-def _state(network: nn.Module) -> dict:
-    return network.state_dict()
+def _state(network: nn.Module, prefix: str = "") -> dict:
+    return {prefix + key: value for key, value in network.state_dict().items()}
 
 
 def main() -> None:

@@ -58,3 +58,8 @@ def test_a_map_is_localized_with_it(exact):
     assert np.allclose(
         found.pose.cam_from_world.matrix(), exact.images[name].cam_from_world().matrix(), atol=1e-3
     )
+
+
+def test_the_guide_shows_all_of_it():
+    guide = (EXAMPLE.parents[1] / "docs" / "learned.md").read_text()
+    assert (EXAMPLE / "own_matcher.py").read_text().strip() in guide

@@ -3,6 +3,7 @@
 import json
 from itertools import pairwise
 from pathlib import Path
+from runpy import run_path
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("kornia")
 pytest.importorskip("transformers")
 
-from random_weights import write_random_weights  # noqa: E402
 
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.features import (  # noqa: E402
@@ -36,7 +36,8 @@ STEP = 32  # pixels by which pictures are moved: every network's grid falls onto
 
 @pytest.fixture(scope="session")
 def random_weights(tmp_path_factory):
-    return write_random_weights(tmp_path_factory.mktemp("weights"))
+    writer = run_path(str(Path(__file__).parents[2] / "benchmarks" / "random_weights.py"))
+    return writer["write_random_weights"](tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture

@@ -1,0 +1,195 @@
+"""The paper's four methods on a rendered object: full map, dominating set, random set; time by stage.
+
+    python benchmarks/paper_methods.py -o OUT [--weights WEIGHTS] [--object boulder] [--queries 4]
+
+Weights that are not in WEIGHTS are seeded random ones. Untrained networks find no matches to build a map
+from, so the map then is the object's SIFT map, its keypoints described by the method. With random weights just
+times mean something, and no accuracy is printed.
+"""
+
+import argparse
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from benchmark_scenes import rendered
+from random_weights import write_random_weights
+
+from slimsfm.cli.output import quiet
+from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.onepose import ObjectSequences, read_object
+from slimsfm.evaluation.protocol import Label, evaluate, prepare, queries_of
+from slimsfm.evaluation.table import Row, mean_row
+from slimsfm.features import Features
+from slimsfm.features.image_matching import load_image_matcher
+from slimsfm.features.superpoint import SuperPoint
+from slimsfm.graph import GraphOptions, compute_graph
+from slimsfm.mapping import Map, read_map, write_map
+from slimsfm.mapping.build import BuildOptions
+from slimsfm.mapping.photo_file import shrink_photo
+from slimsfm.mapping.subset import keep_images
+from slimsfm.networks.superpoint import describe_pixels
+from slimsfm.photos import read_image
+from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
+from slimsfm.weights import FOLDER, WEIGHTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """One of the paper's four methods."""
+
+    name: str
+    strategy: str
+    matcher: str = "auto"
+    extractor: str = "superpoint"
+    weights: tuple[str, ...]
+    paper: float  # frames a second with the dominating set over those with the full map
+
+
+METHODS = (
+    Method(
+        name="OnePose",
+        strategy="onepose",
+        weights=("superpoint", "superglue", "onepose"),
+        paper=40.67 / 27.39,
+    ),
+    Method(
+        name="OnePose++",
+        strategy="onepose++",
+        extractor="loftr",
+        weights=("loftr-onepose++", "onepose++"),
+        paper=19.12 / 12.75,
+    ),
+    Method(
+        name="exhaustive SuperGlue",
+        strategy="exhaustive",
+        matcher="superglue",
+        weights=("superpoint", "superglue"),
+        paper=6.66 / 1.40,
+    ),
+    Method(
+        name="exhaustive LightGlue",
+        strategy="exhaustive",
+        matcher="lightglue",
+        weights=("superpoint", "superglue", "lightglue-superpoint"),
+        paper=26.20 / 1.81,
+    ),
+)
+
+
+Describe = Callable[[np.ndarray, Features], np.ndarray]
+
+
+def main() -> None:
+    """Run all methods and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("-o", "--output", required=True, type=Path)
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--object", default="boulder")
+    parser.add_argument("--queries", default=4, type=int)
+    arguments = parser.parse_args()
+    trained = _weights(arguments.output / "weights", arguments.weights)
+    sift = rendered(arguments.object, arguments.output).references
+    made = read_object(arguments.output / "objects" / arguments.object)
+    print(f"{torch.get_num_threads()} threads, {'a GPU' if torch.cuda.is_available() else 'no GPU'}")
+    for method in METHODS:
+        if trained.issuperset(method.weights):
+            map_ = _built(made, method)
+        else:
+            map_ = _described(sift, made, method.extractor)
+        rows = _rows(method, map_, made, arguments.output, arguments.queries)
+        _print(method, rows, is_trained=trained.issuperset(method.weights))
+
+
+def _weights(folder: Path, given: Path | None) -> set[str]:
+    """Fill a folder with random weights and what is given over them; which weights are given."""
+    write_random_weights(folder)
+    found = {name for name, one in WEIGHTS.items() if given and (given / one.file).is_file()}
+    for name in found:
+        shutil.copy(given / WEIGHTS[name].file, folder)  # pyright: ignore[reportOptionalOperand]
+    os.environ[FOLDER] = str(folder)
+    return found
+
+
+def _built(made: ObjectSequences, method: Method) -> Map:
+    matcher = "superglue" if method.extractor == "superpoint" else "nearest"
+    with quiet(), tempfile.TemporaryDirectory() as workspace:
+        options = BuildOptions(extractor=method.extractor, matcher=matcher)
+        return map_object(made, Path(workspace), options).map
+
+
+def _described(map_: Map, made: ObjectSequences, extractor: str) -> Map:
+    """The map with its keypoints described by another method."""
+    photos = {path.name: read_image(path) for path in made.mapping.image_paths if path.name in map_.images}
+    describe = _by_superpoint() if extractor == "superpoint" else _by_loftr()
+    features = {
+        name: replace(map_.features[name], descriptors=describe(photo, map_.features[name]))
+        for name, photo in photos.items()
+    }
+    options = {"weights": "loftr-onepose++"} if extractor == "loftr" else {}
+    info = replace(map_.info, extractor=extractor, extractor_options=options)
+    small = {name: shrink_photo(photo, 640) for name, photo in photos.items()} if options else {}
+    return replace(map_, features=features, info=info, photos=small, appearance=None)
+
+
+def _by_superpoint() -> Describe:
+    maps = SuperPoint().maps
+
+    def describe(photo: np.ndarray, features: Features) -> np.ndarray:
+        gray = torch.from_numpy(photo).float().mean(dim=2)[None, None] / 255
+        pixels = torch.from_numpy(np.round(features.keypoints - 0.5).astype(np.int64))
+        with torch.inference_mode():
+            return describe_pixels(maps(gray)[1], pixels).numpy().astype(np.float16)
+
+    return describe
+
+
+def _by_loftr() -> Describe:
+    matcher = load_image_matcher("loftr", {"weights": "loftr-onepose++"})
+    return lambda photo, features: matcher.describe(
+        matcher.encode(photo), features.keypoints.astype(np.float64)
+    )
+
+
+def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count: int) -> dict[str, Row]:
+    graph = compute_graph(map_, GraphOptions(edges="matches")).graph
+    names, chosen = list(map_.images), dominating_set(graph, ReductionOptions()).chosen
+    variants: Mapping[str, list[Map]] = {
+        "full": [map_],
+        "dominating": [keep_images(map_, (names[i] for i in chosen))],
+        "random": [keep_random_images(map_, len(chosen), seed=seed) for seed in range(3)],
+    }
+    step = max(1, len(made.query.image_paths) // count)
+    queries, rows = prepare(map_, queries_of(made.query)[::step][:count]), {}
+    for variant, maps in variants.items():
+        label = Label(object="", strategy=method.strategy, matcher=method.matcher, variant=variant)
+        stored = [_stored(one, output / "map") for one in maps]
+        rows[variant] = mean_row([evaluate(one, queries, label, map_bytes=0) for one in stored])
+    return rows
+
+
+def _stored(map_: Map, path: Path) -> Map:
+    write_map(map_, path, overwrite=True)
+    return read_map(path)
+
+
+def _print(method: Method, rows: Mapping[str, Row], *, is_trained: bool) -> None:
+    full = rows["full"].scores.seconds
+    for variant, row in rows.items():
+        seconds = row.scores.seconds
+        stages = f"{seconds.extract:6.2f} s {seconds.match:7.2f} s {seconds.pose:6.3f} s"
+        matching = (full.match + full.pose) / (seconds.match + seconds.pose)
+        ratios = f"{full.total / seconds.total:5.1f}x {matching:6.1f}x"
+        paper = f"{method.paper:5.1f}x" if variant == "dominating" else " " * 6
+        found = f"ADD-0.1d {row.scores.add[0.1]:.1f}" if is_trained else "random weights"
+        size = f"{row.references:4.0f} images {row.points:6.0f} points"
+        print(f"{method.name:<21} {variant:<11} {size} {stages} {ratios} {paper}  {found}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
