@@ -1,7 +1,7 @@
 """`slimsfm reduce`: points by default, images or both where asked, within limits."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -237,3 +237,24 @@ def test_images_of_a_dominating_set_are_dropped_to_keep_to_a_size(reduced_to):
 )
 def test_what_cannot_be_met_is_refused_and_nothing_written(refused, arguments, naming):
     refused(*arguments, naming=naming)
+
+
+def test_a_map_built_without_a_detector_keeps_a_dominating_set_with_its_photos(boulder, tmp_path):
+    full = boulder.map
+    photos = {name: np.full((24, 32, 3), row, np.uint8) for row, name in enumerate(full.images)}
+    info = replace(full.info, extractor="loftr", extractor_options={"max_image_size": 640})
+    write_map(replace(full, photos=photos, info=info, appearance=None), tmp_path / "map")
+    found = slimsfm("reduce", tmp_path / "map", "-o", tmp_path / "small")
+    assert found.code == 0
+    assert "dominating set" in found.out
+    assert "no image is left out to predict by" in found.out
+    small = read_map(tmp_path / "small")
+    assert 1 <= len(small.images) < len(full.images)
+    assert list(small.photos) == list(small.images)
+    for command in (
+        ("frontier", tmp_path / "map"),
+        ("reduce", tmp_path / "map", "-o", tmp_path / "x", "--for", "both"),
+    ):
+        refused = slimsfm(*command)
+        assert refused.code == 2
+        assert "was built without a detector" in refused.err

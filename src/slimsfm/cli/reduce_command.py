@@ -13,6 +13,7 @@ from slimsfm.cli.image_choice import ByImages
 from slimsfm.cli.limits import Limits
 from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
 from slimsfm.errors import InputError
+from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.mapping.direct import with_points
 from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map, check_has_features
@@ -72,7 +73,7 @@ def reduce(
     """Make a map small, and say what that costs.
 
     Many ways are tried on the map's own images, each left out in turn, and the smallest that loses nothing is
-    taken; `slimsfm frontier` lists them all.
+    taken; `slimsfm frontier` lists them all. Of a map built without a detector a dominating set is kept.
 
     Args:
         map: A map.
@@ -87,6 +88,8 @@ def reduce(
     check_has_features(full)
     if len(full.images) < 2:
         raise InputError(f"{map}: has one image; there is nothing to reduce")
+    if full.info.extractor in DETECTOR_FREE and not choosing.by.is_wanted:  # there are no points to match
+        choosing = replace(choosing, by=replace(choosing.by, solver="exact"))
     chosen = _chosen(full, map, choosing, execution)
     slim = _slim(full, chosen)
     write_map(slim, output, overwrite=overwrite)

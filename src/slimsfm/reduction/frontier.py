@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slimsfm.errors import MapError
+from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.mapping.subset import keep_images
@@ -98,10 +100,15 @@ def frontier(
         progress: Told of each reference and each candidate.
 
     Raises:
-        MapError: The map was made for direct matching alone.
+        MapError: The map was made for direct matching alone, or built without a detector.
         ValueError: Images are to be chosen but there is no graph.
     """
     check_has_features(map)
+    if map.info.extractor in DETECTOR_FREE:
+        raise MapError(
+            "the map was built without a detector: what it loses cannot be foretold from its features; "
+            "choose images by `slimsfm reduce MAP -o SMALL --solver exact`"
+        )
     if graph is None and "images" in options.uses:
         raise ValueError("graph must be given where images are to be chosen")
     left_out = LeftOut(map)

@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.features import nearest_for
+from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.geometry import corner_error, reprojection_errors
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import Target, unite
@@ -83,7 +84,10 @@ class Trials:
         self._left_out = left_out
         self._matching = nearest_for(map.info.extractor)
         names = list(map.images)
-        places = np.linspace(0, len(names) - 1, min(_MOST_TESTS, len(names))).round().astype(int)
+        most = (
+            0 if map.info.extractor in DETECTOR_FREE else _MOST_TESTS
+        )  # a query has no descriptors
+        places = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
         self.tests = tuple(names[place] for place in places)
         sees = observed(map).astype(np.int32)
         self._common = csr_array(sees @ sees.T)
