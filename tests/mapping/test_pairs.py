@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slimsfm.features import Features, unit_rows
-from slimsfm.mapping.pairs import choose_pairs, exhaustive_pairs, sequential_pairs, similar_pairs, vlad
+from slimsfm.mapping.pairs import choose_pairs, exhaustive_pairs, sequential_pairs, similar_pairs
 
 NAMES = st.lists(st.text("ab01²/ .", min_size=1, max_size=6), min_size=2, max_size=15, unique=True)
 
@@ -107,18 +107,3 @@ def test_auto_is_exhaustive_up_to_200_images_and_sparser_above():
     assert_pairs(many, features)
     assert len(many) < 0.5 * len(exhaustive_pairs(features))
     assert set(many) == {*sequential_pairs(features), *choose_pairs(features, "similar", seed=0)}
-
-
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 30))
-def test_a_global_descriptor_has_unit_length_and_does_not_depend_on_order(seed, count):
-    rng = np.random.default_rng(seed)
-    words = unit_rows(rng.normal(size=(5, 8)).astype(np.float32))
-    descriptors = unit_rows(rng.normal(size=(count, 8)).astype(np.float32))
-    one = vlad(descriptors, words)
-    assert one.shape == (40,)
-    assert np.linalg.norm(one) == pytest.approx(1, abs=1e-5)
-    assert vlad(descriptors[rng.permutation(count)], words) == pytest.approx(one, abs=1e-4)
-
-
-def test_the_global_descriptor_of_nothing_is_zero():
-    assert not vlad(np.zeros((0, 8), np.float32), np.eye(3, 8, dtype=np.float32)).any()

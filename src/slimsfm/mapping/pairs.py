@@ -7,10 +7,9 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
-from scipy.cluster.vq import kmeans2
 
-from slimsfm.arrays import Descriptors
 from slimsfm.features import Features, unit_rows
+from slimsfm.features.vlad import learn_words, vlad
 
 Pairs = list[tuple[str, str]]
 """Pairs of image names, each in sorted order, without repetition, sorted."""
@@ -18,8 +17,7 @@ Pairs = list[tuple[str, str]]
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 
 _MOST_EXHAUSTIVE = 200  # images, up to which "auto" matches each with every other one
-_WORDS = 64  # of the visual vocabulary
-_WORD_SAMPLES = 50_000  # descriptors that it is trained on
+_WORD_SAMPLES = 50_000  # descriptors that words are learned from
 
 
 def choose_pairs(features: Mapping[str, Features], choice: PairChoice, *, seed: int) -> Pairs:
@@ -38,15 +36,10 @@ def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[
     names = sorted(features)
     share = max(1, _WORD_SAMPLES // len(names))
     generator = np.random.default_rng(seed)
-    samples = [unit_rows(generator.permutation(features[name].descriptors, axis=0)[:share]) for name in names]
-    words = _vocabulary(np.unique(np.concatenate(samples), axis=0), seed)
+    parts = [unit_rows(generator.permutation(features[name].descriptors, axis=0)[:share]) for name in names]
+    samples = np.concatenate(parts)
+    words = learn_words(samples, seed) if len(samples) else np.zeros((1, samples.shape[1]), np.float32)
     return np.stack([vlad(unit_rows(features[name].descriptors), words) for name in names])
-
-
-def _vocabulary(samples: Descriptors, seed: int) -> Float32[np.ndarray, "k d"]:
-    if len(samples) <= _WORDS:
-        return samples if len(samples) else np.zeros((1, samples.shape[1]), np.float32)
-    return kmeans2(samples, _WORDS, minit="++", rng=seed)[0].astype(np.float32)
 
 
 def exhaustive_pairs(names: Iterable[str]) -> Pairs:
@@ -77,20 +70,3 @@ def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
-
-
-def vlad(descriptors: Descriptors, words: Float32[np.ndarray, "k d"]) -> Float32[np.ndarray, " kd"]:
-    """Describe an image by the residuals of its local descriptors to their nearest visual words [1].
-
-    Each word's sum is normalized, then the whole, against bursts of repeated texture [2].
-
-    References:
-        [1] Jegou, Douze, Schmid and Perez, Aggregating Local Descriptors into a Compact Image Representation,
-            CVPR 2010.
-        [2] Arandjelovic and Zisserman, All about VLAD, CVPR 2013.
-    """
-    nearest = (descriptors @ words.T - 0.5 * (words**2).sum(axis=1)).argmax(axis=1)
-    sums = np.zeros_like(words)
-    np.add.at(sums, nearest, descriptors - words[nearest])
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-    return (sums / max(float(np.linalg.norm(sums)), 1e-12)).ravel()
