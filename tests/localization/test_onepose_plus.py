@@ -56,7 +56,8 @@ def plain(exact) -> Map:
         name: replace(one, descriptors=rng.normal(size=(len(one), 384)).astype(np.float16))
         for name, one in exact.features.items()
     }
-    return replace(exact, features=described, info=replace(exact.info, extractor="loftr"))
+    info = replace(exact.info, extractor="loftr", extractor_options={"weights": "loftr-onepose++"})
+    return replace(exact, features=described, info=info)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def pictured(plain) -> Map:
     """The same with photos, a tenth as large as what the cameras took."""
     rng = np.random.default_rng(2)
     photos = {name: rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for name in plain.images}
-    info = replace(plain.info, extractor_options={"max_image_size": 64})
+    info = replace(plain.info, extractor_options={**plain.info.extractor_options, "max_image_size": 64})
     return replace(plain, photos=photos, info=info)
 
 
@@ -238,6 +239,9 @@ def test_the_object_is_found_by_photos_of_any_size(plain, step):
 def test_a_map_of_keypoints_and_missing_weights_are_told_of(exact, plain, monkeypatch, tmp_path):
     with pytest.raises(MapError, match="--extractor loftr"):
         OnePosePlus(exact)
+    other = replace(plain, info=replace(plain.info, extractor_options={"weights": "loftr"}))
+    with pytest.raises(MapError, match=r"knows features of LoFTR_wsize9\.ckpt alone"):
+        OnePosePlus(other)
     monkeypatch.setenv("SLIMSFM_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match=r"OnePosePlus_model\.ckpt"):
         OnePosePlus(plain)

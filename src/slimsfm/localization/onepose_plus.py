@@ -39,10 +39,12 @@ from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.networks.devices import choose_device, inference
 from slimsfm.networks.loading import load_network
 from slimsfm.networks.onepose_plus import OnePosePlusMatcher, state_of
+from slimsfm.weights import WEIGHTS
 
 _POINTS = OnePosePointsOptions(max_points=15000, leaves=0)  # as by the authors
 _COARSE, _FINE = 256, 128  # numbers of which a descriptor is made up
 _ALL = Region(left=0.0, top=0.0, right=1.0, bottom=1.0)  # of an image, as shares of its width and height
+_WEIGHTS = "loftr-onepose++"  # by which a map must have been built
 _CELL_PX = 8.0  # side of a cell for which what `region_by_matches` tolerates is right
 
 
@@ -170,6 +172,11 @@ def _check_map(map: Map) -> None:
             f"strategy onepose++ needs a map built without a detector, but this one has {map.info.extractor} "
             "features; build one by `slimsfm build PHOTOS -o MAP --extractor loftr`"
         )
+    if map.info.extractor_options.get("weights") != _WEIGHTS:
+        raise MapError(
+            f"strategy onepose++ knows features of {WEIGHTS[_WEIGHTS].file} alone, and the map was built by "
+            "other weights; put that file into the folder of weights and build the map again"
+        )
 
 
 def _described(map: Map, prepared: OnePosePoints, device: torch.device) -> DescribedPoints:
@@ -185,7 +192,7 @@ def _described(map: Map, prepared: OnePosePoints, device: torch.device) -> Descr
 def _image_matcher(map: Map) -> Loftr:
     """What finds the object; weights that are missing are told of now, not when a query comes."""
     size = map.info.extractor_options.get("max_image_size", 640)
-    matcher = Loftr(weights="loftr-onepose++", max_image_size=size)
+    matcher = Loftr(weights=_WEIGHTS, max_image_size=size)
     _ = matcher.network
     return matcher
 
