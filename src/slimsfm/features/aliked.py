@@ -81,7 +81,7 @@ class Aliked:
 def exportable(method: str) -> Exportable:
     """What an ONNX file holds: image in, scores of pixels and four maps of features out; sides by 32."""
     return Exportable(
-        network=Aliked(model=method).maps.cpu(),
+        network=Aliked(model=method).maps.cpu(),  # pyright: ignore[reportArgumentType]
         inputs={"image": torch.zeros(1, 3, 96, 128)},
         dynamic={"image": (2, 3)},
         outputs=("scores", "features1", "features2", "features3", "features4"),

@@ -41,7 +41,7 @@ class LightGlue:
         made, weights = network_for(self._features), f"lightglue-{self._features}"
         loaded = load_network(made, weights, lightglue_state, derived={"confidence_thresholds"})
         for layer in loaded.transformers:
-            layer.cross_attn = CrossAttention(layer.cross_attn)
+            layer.cross_attn = CrossAttention(layer.cross_attn)  # pyright: ignore[reportArgumentType]
         return loaded
 
     def match(self, features1: Features, features2: Features) -> IndexPairs:

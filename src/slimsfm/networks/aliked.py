@@ -1,8 +1,8 @@
 """What of ALIKED [1] sees the image, from the layers of kornia, in an order that costs a CPU less.
 
-The scores' first layer is linear and does not look around, so that it runs before the maps are enlarged to the
-image's size; deformable convolutions sample with one call instead of gathering four neighbours in turn. Both
-change nothing but the rounding.
+The scores' first layer is linear and does not look around, so that it runs before the maps are enlarged to
+the image's size; deformable convolutions sample with one call instead of gathering four neighbours in turn.
+Both change nothing but the rounding.
 
 References:
     [1] Zhao, Wu, Chen, Chen, Xu and Lee, ALIKED: A Lighter Keypoint and Descriptor Extraction Network via
@@ -40,8 +40,10 @@ class AlikedMaps(nn.Module):
         """Of a network; its layers are shared, and laid out as convolutions on the CPU are fastest."""
         super().__init__()
         for block in (network.block3, network.block4):
-            block.conv1, block.conv2 = Deformable(block.conv1), Deformable(block.conv2)
-        self.network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+            block.conv1 = Deformable(block.conv1)  # pyright: ignore[reportArgumentType]
+            block.conv2 = Deformable(block.conv2)  # pyright: ignore[reportArgumentType]
+        self.network = network
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def forward(self, image: Float[Tensor, "1 3 height width"]) -> tuple[Tensor, ...]:
         """Run the convolutions on an RGB image, from 0 to 1, whose sides are multiples of 32.
@@ -62,13 +64,11 @@ class AlikedMaps(nn.Module):
         return self._scores(maps), *maps
 
     def _scores(self, maps: list[Tensor]) -> Tensor:
-        first, *others = self.network.score_head
-        parts = first.weight.chunk(len(maps), dim=1)
+        head = self.network.score_head
+        parts = head.get_parameter("0.weight").chunk(len(maps), dim=1)
         mixed = [F.conv2d(one, part) for one, part in zip(maps, parts, strict=True)]
         scores = sum((enlarged(one, maps[0]) for one in mixed[1:]), mixed[0])
-        for layer in others:
-            scores = layer(scores)
-        return scores.sigmoid()
+        return head[1:](scores).sigmoid()
 
 
 class Deformable(nn.Module):
@@ -115,15 +115,8 @@ def dense_maps(run: Run, pixels: Float[Tensor, "1 3 height width"]) -> DenseMaps
 def _joined(maps: list[Tensor]) -> Float[Tensor, "1 d height width"]:
     """Features of unit length from maps of several resolutions, the finest of which comes first."""
     with torch.autocast(maps[0].device.type, enabled=False):
-        finest = maps[0].float().contiguous(memory_format=torch.channels_last)
-        parts = [
-            finest,
-            *(
-                enlarged(one.float().contiguous(memory_format=torch.channels_last), finest)
-                for one in maps[1:]
-            ),
-        ]
-        features = torch.cat(parts, dim=1)
+        single = [one.float().contiguous(memory_format=torch.channels_last) for one in maps]
+        features = torch.cat([single[0], *(enlarged(one, single[0]) for one in single[1:])], dim=1)
         lengths = torch.einsum("bchw,bchw->bhw", features, features).sqrt_()
         return features.div_(lengths.clamp_(min=1e-12)[:, None])
 

@@ -1,7 +1,7 @@
 """The stages of SuperPoint [1]: what sees the image, which pixels are keypoints, what describes them.
 
-The convolutions are those of transformers. Positions are pixels (x, y) of what the network sees, the centre of
-the top-left pixel at (0, 0); a cell is 8 x 8 pixels.
+The convolutions are those of transformers. Positions are pixels (x, y) of what the network sees, the centre
+of the top-left pixel at (0, 0); a cell is 8 x 8 pixels.
 
 References:
     [1] DeTone, Malisiewicz and Rabinovich, SuperPoint: Self-Supervised Interest Point Detection and
@@ -25,7 +25,8 @@ class SuperPointMaps(nn.Module):
     def __init__(self, network: SuperPointForKeypointDetection) -> None:
         """Of a network; its layers are shared, and laid out as convolutions on the CPU are fastest."""
         super().__init__()
-        self.network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.network = network
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def forward(self, gray: Float[Tensor, "1 1 height width"]) -> tuple[Tensor, Tensor]:
         """Run the convolutions on a gray image from 0 to 1; beyond the last whole cell nothing is seen.
@@ -63,5 +64,5 @@ def describe_pixels(
     height, width = (_CELL * side for side in descriptors.shape[2:])
     far = torch.tensor([width, height], device=pixels.device) - (_CELL / 2 + 0.5)
     grid = 2 * (pixels - (_CELL / 2 - 0.5)) / far - 1
-    sampled = F.grid_sample(descriptors, grid[None, None].to(descriptors.dtype), align_corners=True)
+    sampled = F.grid_sample(descriptors.float(), grid[None, None], align_corners=True)
     return F.normalize(sampled[0, :, 0].T, dim=1)

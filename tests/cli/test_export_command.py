@@ -1,0 +1,58 @@
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("transformers")
+pytest.importorskip("onnxscript")
+
+from transformers import SuperPointConfig, SuperPointForKeypointDetection  # noqa: E402
+
+from commands import contents, slimsfm  # noqa: E402
+from networks.seeded import fill  # noqa: E402
+from slimsfm.features.exporting import EXPORTABLE  # noqa: E402
+from slimsfm.weights import FOLDER, WEIGHTS  # noqa: E402
+
+
+@pytest.fixture
+def weights(tmp_path, monkeypatch):
+    monkeypatch.delenv(FOLDER, raising=False)
+    network = SuperPointForKeypointDetection(SuperPointConfig())
+    fill(network, 0)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    torch.save(network.state_dict(), folder / "superpoint_v1.pth")
+    monkeypatch.setenv(FOLDER, str(folder))  # put back what --weights sets for the process
+    return folder
+
+
+def test_a_file_is_written_and_what_to_do_with_it_said(weights):
+    path = weights / "superpoint.onnx"
+    outcome = slimsfm("export", "superpoint", "-o", path, "--weights", weights)
+    assert outcome.code == 0, outcome.err
+    assert f"{path}: superpoint, " in outcome.out
+    assert "runs superpoint on the CPU as superpoint.onnx in the folder of weights" in outcome.out
+    assert sorted(contents(weights)) == ["superpoint.onnx", "superpoint_v1.pth"]
+    again = slimsfm("export", "superpoint", "-o", path)
+    assert again.code == 2
+    assert "pass --overwrite" in again.err
+
+
+@pytest.mark.parametrize("method", ["superglue", "onepose", "nonsense"])
+def test_what_cannot_be_exported_is_told_with_what_can(tmp_path, method):
+    outcome = slimsfm("export", method, "-o", tmp_path / "x.onnx")
+    assert outcome.code == 2
+    assert len(outcome.err.splitlines()) == 1
+    assert f"'{method}' cannot be exported" in outcome.err
+    assert all(name in outcome.err for name in EXPORTABLE)
+    assert contents(tmp_path) == {}
+
+
+def test_a_folder_is_not_replaced_by_a_file(weights):
+    before = contents(weights)
+    outcome = slimsfm("export", "superpoint", "-o", weights, "--overwrite")
+    assert outcome.code == 2
+    assert "superpoint.onnx" in outcome.err
+    assert contents(weights) == before
+
+
+def test_methods_are_called_as_their_weights_are():
+    assert EXPORTABLE.keys() < WEIGHTS.keys()
