@@ -137,8 +137,11 @@ def test_superpoint_finds_what_the_library_finds(superpoint):
     gray = torch.from_numpy(image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32) / 255)
     with torch.inference_mode():
         found = superpoint(gray.expand(1, 3, -1, -1))
+    pixels = found.keypoints[0].numpy() * (131, 90)
+    inside = (pixels < np.array([131, 90]) // 8 * 8 - 4).all(axis=1)  # the library forgets these two sides
     order = np.argsort(-found.scores[0].numpy(), kind="stable")
-    keypoints = found.keypoints[0].numpy()[order] * (131, 90) + 0.5
+    order = order[inside[order]]
+    keypoints = pixels[order] + 0.5
     assert np.allclose(features.keypoints, keypoints, atol=1e-3)
     assert np.allclose(features.descriptors, found.descriptors[0].numpy()[order], atol=1e-3)
 

@@ -118,7 +118,10 @@ class Loftr:
         """The network with its trained weights."""
         is_plain = self.weights == "loftr"
         made = make_network(window=5 if is_plain else 9, coarse_context=is_plain)
-        return load_network(made, self.weights, state_of)
+        loaded = load_network(made, self.weights, state_of)
+        # A quarter faster on the CPU.
+        loaded.backbone.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        return loaded
 
     @cached_property
     def _last(self) -> local:

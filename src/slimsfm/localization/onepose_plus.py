@@ -61,6 +61,7 @@ class OnePosePlus:
         _check_map(map)
         self._box = map.box
         self._network = load_network(OnePosePlusMatcher(), "onepose++", state_of)
+        self._network.backbone.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         prepared = prepare_points(map, _POINTS)
         self._points = prepared.points
         self._described = _described(map, prepared, choose_device())

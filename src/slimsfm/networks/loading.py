@@ -3,8 +3,11 @@
 import pickle
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from socket import getaddrinfo
 from types import ModuleType
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
+from urllib.request import getproxies
 
 import torch
 from torch import Tensor, nn
@@ -140,13 +143,28 @@ def _from_hub(name: str) -> Path:
 
 
 def _from_hugging_face(address: str) -> Path | None:
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import constants, hf_hub_download, try_to_load_from_cache
 
     owner, repository, file = address.removeprefix("hf:").split("/")
+    cached = try_to_load_from_cache(f"{owner}/{repository}", file)
+    if isinstance(cached, str):
+        return Path(cached)
+    if not _is_known(constants.ENDPOINT):
+        return None
     try:
         return Path(hf_hub_download(f"{owner}/{repository}", file))
     except Exception:  # no network, no such file, an odd proxy: all mean that it cannot be had
         return None
+
+
+def _is_known(address: str) -> bool:
+    """Whether a host can be found: without a network, libraries try for half a minute and say so."""
+    if getproxies():
+        return True
+    try:
+        return bool(getaddrinfo(urlsplit(address).hostname, 443))
+    except OSError:
+        return False
 
 
 def _from_address(address: str) -> Path | None:

@@ -16,7 +16,7 @@ from transformers import SuperPointForKeypointDetection
 from transformers.models.superpoint.modeling_superpoint import simple_nms
 
 _CELL = 8  # pixels
-_BORDER = 4  # pixels above and left of which there is no keypoint, as the library has it
+_BORDER = 4  # pixels of the rim without keypoints, as the authors have it; the library forgets two sides
 
 
 class SuperPointMaps(nn.Module):
@@ -48,7 +48,9 @@ def strongest_pixels(
     """Pixels that score best within a radius and more than a threshold, row by row, and their scores."""
     best = simple_nms(scores[0], radius)[0]
     rows, columns = torch.nonzero(best > threshold).T
-    inside = (rows >= _BORDER) & (columns >= _BORDER)
+    height, width = best.shape
+    inside = (rows >= _BORDER) & (rows < height - _BORDER)
+    inside &= (columns >= _BORDER) & (columns < width - _BORDER)
     rows, columns = rows[inside], columns[inside]
     return torch.stack([columns, rows], dim=1), best[rows, columns]
 

@@ -84,9 +84,7 @@ class Trials:
         self._left_out = left_out
         self._matching = nearest_for(map.info.extractor)
         names = list(map.images)
-        most = (
-            0 if map.info.extractor in DETECTOR_FREE else _MOST_TESTS
-        )  # a query has no descriptors
+        most = 0 if map.info.extractor in DETECTOR_FREE else _MOST_TESTS  # a query has no descriptors
         places = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
         self.tests = tuple(names[place] for place in places)
         sees = observed(map).astype(np.int32)
