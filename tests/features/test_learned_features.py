@@ -1,6 +1,7 @@
 """What learned extractors and matchers keep to, with seeded random weights where there are no others."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from runpy import run_path
@@ -174,6 +175,13 @@ def test_features_that_a_matcher_does_not_know_are_named(method, features, known
         InputError, match=f"matcher '{method}': features must be .*{known}.* got '{features}'"
     ):
         load_matcher(method, features)
+
+
+@pytest.mark.usefixtures("untrained")
+def test_sift_of_old_maps_lacks_what_lightglue_looks_at():
+    of_old = replace(described(np.random.default_rng(0), 20, 128), frames=None)
+    with pytest.raises(InputError, match="scales and orientations of SIFT features"):
+        load_matcher("lightglue", "sift").match(of_old, of_old)
 
 
 def test_an_unknown_matcher_is_named():

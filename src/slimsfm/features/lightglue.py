@@ -17,6 +17,7 @@ from kornia.feature.lightglue import CrossBlock
 from torch import Tensor, nn
 
 from slimsfm.arrays import IndexPairs
+from slimsfm.errors import InputError
 from slimsfm.features.base import Features, unit_rows
 from slimsfm.networks.devices import choose_device, inference
 from slimsfm.networks.loading import load_network
@@ -71,7 +72,10 @@ class LightGlue:
         }
         if self._features == "sift":
             if features.frames is None:
-                raise ValueError("features must have scales and orientations; extract them anew")
+                raise InputError(
+                    "lightglue looks at the scales and orientations of SIFT features, and these have none: "
+                    "build or import the map again, or match by nearest"
+                )
             given["scales"], given["oris"] = features.frames.T
         return {
             key: torch.from_numpy(np.ascontiguousarray(value)).to(device)[None]
