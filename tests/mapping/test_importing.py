@@ -13,7 +13,7 @@ from PIL import Image
 from slimsfm.errors import ImageError, InputError, ModelError
 from slimsfm.features import unit_rows
 from slimsfm.localization.localizer import Localizer
-from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.importing import ImportOptions, _frames, import_model
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.photos import read_image
 from slimsfm.synthetic.scene import mapping_take
@@ -272,3 +272,14 @@ def test_one_source_of_descriptors_is_enough():
         ImportOptions(database=path, images=path)
     with pytest.raises(ValueError, match="matches needs features"):
         ImportOptions(matches=path)
+
+
+def test_a_database_tells_scales_and_orientations_as_colmap_reads_them():
+    read = pycolmap.FeatureKeypoint.from_shape_parameters
+    made = [read(10.0 + i, 20.0, 1.5 + i, 2.0 + i, 0.4 * i, 0.1) for i in range(5)]
+    values = np.array([(k.x, k.y, k.a11, k.a12, k.a21, k.a22) for k in made], np.float32)
+    expected = np.array([(k.compute_scale(), k.compute_orientation()) for k in made])
+    assert np.allclose(_frames(values), expected, atol=1e-5)
+    short = np.array([(k.x, k.y, *frame) for k, frame in zip(made, expected, strict=True)], np.float32)
+    assert np.allclose(_frames(short), expected, atol=1e-5)
+    assert _frames(values[:, :2]) is None

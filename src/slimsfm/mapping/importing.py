@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Int64
+from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
@@ -156,18 +156,30 @@ def _read_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
 def _read_database_features(
     database: pycolmap.Database, image_id: int, image: pycolmap.Image
 ) -> tuple[Features, str]:
-    keypoints = np.asarray(database.read_keypoints(image_id), np.float32)[:, :2]
+    keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
     stored = database.read_descriptors(image_id)
     is_sift = stored.type in (pycolmap.FeatureExtractorType.SIFT, pycolmap.FeatureExtractorType.UNDEFINED)
     data = np.asarray(stored.data, np.uint8)
     camera = camera_of(image)
     features = Features(
-        keypoints=np.ascontiguousarray(keypoints),
+        keypoints=np.ascontiguousarray(keypoints[:, :2]),
         descriptors=data if is_sift else data.view(np.float32),
         scores=np.ones(len(keypoints), np.float32),
         image_size=(camera.width, camera.height),
+        frames=_frames(keypoints) if is_sift else None,
     )
     return features, "sift" if is_sift else stored.type.name.lower().split("_")[0]
+
+
+def _frames(keypoints: Float32[np.ndarray, "n columns"]) -> Float32[np.ndarray, "n 2"] | None:
+    """Scales and orientations: the last two of four columns, or what the affine shapes of six tell."""
+    if keypoints.shape[1] == 4:
+        return keypoints[:, 2:]
+    if keypoints.shape[1] < 6:
+        return None
+    shapes = keypoints[:, 2:].reshape(-1, 2, 2)
+    scales = np.linalg.norm(shapes, axis=1).mean(axis=1)
+    return np.stack([scales, np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0])], axis=1)
 
 
 def _from_hloc(model: pycolmap.Reconstruction, options: ImportOptions) -> _Source:
