@@ -23,8 +23,7 @@ from random_weights import write_random_weights
 from slimsfm.cli.output import quiet
 from slimsfm.datasets.mapping import map_object
 from slimsfm.datasets.onepose import ObjectSequences, read_object
-from slimsfm.evaluation.metrics import score
-from slimsfm.evaluation.protocol import Label, PreparedQuery, errors_of, evaluate, prepare, queries_of
+from slimsfm.evaluation.protocol import Label, PreparedQuery, evaluate, prepare, queries_of, row_of
 from slimsfm.evaluation.table import Row, mean_row
 from slimsfm.features import Features
 from slimsfm.features.image_matching import load_image_matcher
@@ -189,15 +188,7 @@ def _row_of_boxes(map_: Map, queries: list[PreparedQuery], label: Label, *, map_
         localizer.localize_near(read_image(one.path), one.camera, one.cam_from_world)
         for one in (prepared.query for prepared in (queries[0], *queries))
     ][1:]
-    return Row(
-        object=label.object,
-        strategy=label.strategy,
-        variant=label.variant,
-        references=len(map_.images),
-        points=len(map_.point3D_ids),
-        map_bytes=map_bytes,
-        scores=score(errors_of(map_, queries, found), found, metric=True),
-    )
+    return row_of(map_, queries, found, label, map_bytes=map_bytes)
 
 
 def _stored(map_: Map, path: Path) -> Map:

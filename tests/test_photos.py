@@ -3,7 +3,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.photos import camera_from_exif, list_images, read_image, read_mask
+from slimsfm.photos import camera_from_exif, list_images, read_image, read_mask, shrink
 
 UPRIGHT = np.zeros((4, 6, 3), np.uint8)
 UPRIGHT[0, 0], UPRIGHT[0, -1], UPRIGHT[-1, 0], UPRIGHT[-1, -1] = (
@@ -124,3 +124,13 @@ def test_a_folder_without_images_is_an_input_error(tmp_path):
         list_images(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         list_images(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("shape", [(30, 40, 3), (40, 30), (7, 400)])
+def test_shrinking_keeps_the_shape_and_leaves_small_images_alone(shape):
+    image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    small = shrink(image, 20)
+    assert max(small.shape[:2]) == 20
+    assert small.shape[2:] == image.shape[2:]
+    assert min(small.shape[:2]) == max(1, round(min(shape[:2]) * 20 / max(shape[:2])))
+    assert shrink(image, max(shape[:2])) is image

@@ -4,8 +4,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
+from jaxtyping import UInt8
 from PIL import ExifTags, ImageOps, UnidentifiedImageError
 from PIL import Image as PillowImage
 
@@ -89,3 +91,13 @@ def camera_from_exif(path: Path) -> pycolmap.Camera:
     guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
     guess.has_prior_focal_length = camera.has_prior_focal_length
     return guess
+
+
+def shrink(image: UInt8[np.ndarray, "_ _ *channels"], max_size: int) -> UInt8[np.ndarray, "_ _ *channels"]:
+    """Shrink an image, RGB or gray, so that its longer side has so many pixels; a smaller one stays."""
+    height, width = image.shape[:2]
+    scale = min(1.0, max_size / max(height, width))
+    if scale == 1.0:
+        return image
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

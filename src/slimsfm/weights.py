@@ -20,6 +20,10 @@ FOLDER = "SLIMSFM_WEIGHTS"
 _RESEARCH = "Magic Leap: research only"
 
 
+DEVICE = "SLIMSFM_DEVICE"
+"""Environment variable that says where networks run: auto, cpu or cuda."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class WeightFile:
     """A published file of trained weights."""

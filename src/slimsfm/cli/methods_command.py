@@ -21,10 +21,9 @@ class _Method:
     by: str
     licence: str
     weights: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
 
 
-_LEARNED = ("torch", "kornia", "transformers")
+_LEARNED = ("torch", "kornia", "transformers")  # what methods with weights need
 _METHODS = (
     _Method(kind="extractor", name="sift", by="OpenCV", licence="Apache-2.0"),
     _Method(
@@ -33,18 +32,14 @@ _METHODS = (
         by="kornia",
         licence="Apache-2.0",
         weights=("aliked-n16", "aliked-t16"),
-        needs=_LEARNED,
     ),
-    _Method(
-        kind="extractor", name="disk", by="kornia", licence="Apache-2.0", weights=("disk",), needs=_LEARNED
-    ),
+    _Method(kind="extractor", name="disk", by="kornia", licence="Apache-2.0", weights=("disk",)),
     _Method(
         kind="extractor",
         name="superpoint",
         by="transformers",
         licence="Apache-2.0",
         weights=("superpoint",),
-        needs=_LEARNED,
     ),
     _Method(kind="matcher", name="nearest", by="slimsfm", licence="BSD-3-Clause"),
     _Method(
@@ -53,7 +48,6 @@ _METHODS = (
         by="kornia",
         licence="Apache-2.0",
         weights=tuple(name for name in WEIGHTS if name.startswith("lightglue-")),
-        needs=_LEARNED,
     ),
     _Method(
         kind="matcher",
@@ -61,7 +55,6 @@ _METHODS = (
         by="transformers",
         licence="Apache-2.0",
         weights=("superglue",),
-        needs=_LEARNED,
     ),
     _Method(
         kind="detector-free",
@@ -69,7 +62,6 @@ _METHODS = (
         by="kornia",
         licence="Apache-2.0",
         weights=("loftr", "loftr-onepose++"),
-        needs=_LEARNED,
     ),
     *(
         _Method(kind="strategy", name=name, by="slimsfm", licence="BSD-3-Clause")
@@ -82,7 +74,6 @@ _METHODS = (
             by="slimsfm",
             licence="BSD-3-Clause",
             weights=(name,),
-            needs=_LEARNED,
         )
         for name in ("onepose", "onepose++")
     ),
@@ -119,7 +110,7 @@ def methods(networks: Annotated[Networks, Flat] = Networks()) -> None:
 
 
 def _installed(method: _Method) -> str:
-    missing = [name for name in method.needs if find_spec(name) is None]
+    missing = [name for name in (_LEARNED if method.weights else ()) if find_spec(name) is None]
     return f"needs {', '.join(missing)}: pip install 'slimsfm[learned]'" if missing else "yes"
 
 

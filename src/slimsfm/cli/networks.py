@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from slimsfm.weights import FOLDER, weights_folder
-
-_DEVICE = "SLIMSFM_DEVICE"  # as of `networks.devices`, which needs PyTorch to be imported
+from slimsfm.weights import DEVICE, FOLDER, weights_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,5 +27,5 @@ class Networks:
         if self.weights is not None:
             os.environ[FOLDER] = str(self.weights)
         if self.device is not None:
-            os.environ[_DEVICE] = self.device
+            os.environ[DEVICE] = self.device
         weights_folder()

@@ -148,6 +148,18 @@ def evaluate(
         progress: Told of each query.
     """
     found = localize_all(map, queries, label.strategy, label.matcher, progress)
+    return row_of(map, queries, found, label, map_bytes=map_bytes)
+
+
+def row_of(
+    map: Map,
+    queries: Sequence[PreparedQuery],
+    found: Sequence[Localization],
+    label: Label,
+    *,
+    map_bytes: int,
+) -> Row:
+    """Sum up what localizing queries against one map gave; arguments as of `evaluate`."""
     errors = errors_of(map, queries, found)
     return Row(
         object=label.object,

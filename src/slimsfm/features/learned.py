@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
+from slimsfm.photos import shrink
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,14 +28,11 @@ class NetworkInput:
 
 def network_input(image: Image, max_image_size: int, device: torch.device) -> NetworkInput:
     """Shrink an image, so that its longer side has at most so many pixels, and hand it to a device."""
-    height, width = image.shape[:2]
-    scale = min(1.0, max_image_size / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    (height, width), small = image.shape[:2], shrink(image, max_image_size)
     pixels = torch.from_numpy(np.ascontiguousarray(small)).to(device).permute(2, 0, 1)[None]
     return NetworkInput(
         pixels=pixels.to(torch.float32) / 255,
-        factors=np.array([width / size[0], height / size[1]], np.float32),
+        factors=np.array([width / small.shape[1], height / small.shape[0]], np.float32),
         image_size=(width, height),
     )
 

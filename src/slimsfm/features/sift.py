@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
+from slimsfm.photos import shrink
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +55,8 @@ class Sift:
         """Find features; none where the mask, of the image's size, is 0."""
         height, width = image.shape[:2]
         scale = min(1.0, self.max_image_size / max(height, width))
-        gray = _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), scale)
-        small_mask = None if mask is None else _shrink(mask, scale)
+        gray = shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8), self.max_image_size)
+        small_mask = None if mask is None else shrink(mask, self.max_image_size)
         detector = cv2.SIFT.create(
             self.max_features, contrastThreshold=self.contrast_threshold, enable_precise_upscale=True
         )
@@ -83,11 +84,3 @@ def root_sift(descriptors: Float32[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n
     """Hellinger-normalized descriptors as bytes, 512 to the unit, as COLMAP stores them."""
     sums = np.maximum(np.abs(descriptors).sum(axis=1, keepdims=True), 1e-12)
     return np.clip(np.round(512 * np.sqrt(descriptors / sums)), 0, 255).astype(np.uint8)
-
-
-def _shrink(image: GrayImage, scale: float) -> UInt8[np.ndarray, "h w"]:
-    if scale == 1.0:
-        return image
-    height, width = image.shape
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -61,6 +61,8 @@ class NearestMatching:
         self._options = options
         names = list(map.images)
         self._target = lru_cache(cached)(lambda row: reference_target(map, names[row]))
+        for row in range(len(names) if cached is None else 0):
+            self._target(row)  # read now, not when the first query comes
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:
         """Match a query's descriptors with those of an image."""
@@ -83,6 +85,8 @@ class PairMatching:
         self._points = [seen.points for seen in map.observations.values()]
         names = list(map.images)
         self._seeing = lru_cache(cached)(lambda row: _seeing(map, names[row]))
+        for row in range(len(names) if cached is None else 0):
+            self._seeing(row)  # read now, not when the first query comes
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:  # noqa: ARG002
         """Match all of a query's features with those of an image."""

@@ -25,8 +25,6 @@ class References:
         """
         check_has_features(map)
         self._matching: ReferenceMatching = matching_with(map, options)
-        for row in range(len(map.images)):
-            self._matching.target(row)  # read now, not when the first query comes
         self._sees = csr_array(observed(map), dtype=np.float32)
         self._seen_by = csr_array(self._sees.T)
         self._center = map.box.center

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError
 from slimsfm.features.store import creating, opened, read_array
+from slimsfm.photos import shrink
 
 _QUALITY = 95
 
@@ -68,8 +69,4 @@ def _jpeg(photo: Image) -> np.ndarray:
 
 def shrink_photo(photo: Image, max_image_size: int) -> UInt8[np.ndarray, "h w 3"]:
     """Shrink a photo, unless it is small, so that its longer side has so many pixels; as it is read back."""
-    height, width = photo.shape[:2]
-    scale = min(1.0, max_image_size / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = photo if scale == 1.0 else cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.imdecode(_jpeg(np.asarray(small, np.uint8)), cv2.IMREAD_COLOR_RGB), np.uint8)
+    return np.asarray(cv2.imdecode(_jpeg(shrink(photo, max_image_size)), cv2.IMREAD_COLOR_RGB), np.uint8)

@@ -6,9 +6,7 @@ from typing import Literal
 import torch
 
 from slimsfm.errors import InputError
-
-DEVICE = "SLIMSFM_DEVICE"
-"""Environment variable that says where networks run; `--device` of the command line sets it."""
+from slimsfm.weights import DEVICE
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
