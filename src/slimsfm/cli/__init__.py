@@ -15,9 +15,11 @@ COMMANDS = {
     "frontier": "what a map can be reduced to, and what that costs",
     "localize": "poses of new images",
     "track": "poses of a video, frame by frame",
+    "view": "a map in the browser, before and after; localizes images by a click",
     "benchmark": "speed and accuracy, full against slim",
+    "report": "a benchmark on one page: what is kept, what it costs, where it fails",
     "methods": "extractors, matchers and strategies there are, and their weights",
-    "export": "a network as an ONNX file",
+    "export": "a network as an ONNX file, a map for hloc",
     "synthesize": "textured objects with exact ground truth",
     "demo": "all of it, on objects it makes itself",
 }
