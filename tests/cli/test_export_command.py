@@ -26,19 +26,19 @@ def weights(tmp_path, monkeypatch):
 
 def test_a_file_is_written_and_what_to_do_with_it_said(weights):
     path = weights / "superpoint.onnx"
-    outcome = slimsfm("export", "superpoint", "-o", path, "--weights", weights)
+    outcome = slimsfm("export", "onnx", "superpoint", "-o", path, "--weights", weights)
     assert outcome.code == 0, outcome.err
     assert f"{path}: superpoint, " in outcome.out
     assert "runs superpoint on the CPU as superpoint.onnx in the folder of weights" in outcome.out
     assert sorted(contents(weights)) == ["superpoint.onnx", "superpoint_v1.pth"]
-    again = slimsfm("export", "superpoint", "-o", path)
+    again = slimsfm("export", "onnx", "superpoint", "-o", path)
     assert again.code == 2
     assert "pass --overwrite" in again.err
 
 
 @pytest.mark.parametrize("method", ["superglue", "onepose", "nonsense"])
 def test_what_cannot_be_exported_is_told_with_what_can(tmp_path, method):
-    outcome = slimsfm("export", method, "-o", tmp_path / "x.onnx")
+    outcome = slimsfm("export", "onnx", method, "-o", tmp_path / "x.onnx")
     assert outcome.code == 2
     assert len(outcome.err.splitlines()) == 1
     assert f"'{method}' cannot be exported" in outcome.err
@@ -48,7 +48,7 @@ def test_what_cannot_be_exported_is_told_with_what_can(tmp_path, method):
 
 def test_a_folder_is_not_replaced_by_a_file(weights):
     before = contents(weights)
-    outcome = slimsfm("export", "superpoint", "-o", weights, "--overwrite")
+    outcome = slimsfm("export", "onnx", "superpoint", "-o", weights, "--overwrite")
     assert outcome.code == 2
     assert "superpoint.onnx" in outcome.err
     assert contents(weights) == before

@@ -89,7 +89,7 @@ def test_without_a_file_or_a_cpu_pytorch_runs(tiny, folder, monkeypatch):
 
 def test_files_that_are_not_the_methods_own_are_told(tiny, folder):
     (folder / "superpoint.onnx").write_bytes(tiny.read_bytes())
-    with pytest.raises(InputError, match=r"superpoint\.onnx: was not made by slimsfm export superpoint"):
+    with pytest.raises(InputError, match=r"superpoint\.onnx: was not made by slimsfm export onnx superpoint"):
         onnx_run("superpoint")
     (folder / "superpoint.onnx").write_bytes(b"something")
     with pytest.raises(InputError, match=r"superpoint\.onnx: onnxruntime cannot read it .* make it anew by"):

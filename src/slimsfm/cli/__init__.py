@@ -18,6 +18,7 @@ COMMANDS = {
     "view": "a map in the browser, before and after; localizes images by a click",
     "benchmark": "speed and accuracy, full against slim",
     "report": "a benchmark on one page: what is kept, what it costs, where it fails",
+    "figures": "figures of a benchmark, for papers and slides",
     "methods": "extractors, matchers and strategies there are, and their weights",
     "export": "a network as an ONNX file, a map for hloc",
     "synthesize": "textured objects with exact ground truth",

@@ -1,7 +1,8 @@
 """Features and matches on disk, in hloc's HDF5 layout.
 
 `features.h5`: a group an image name with `keypoints` (n, 2), `descriptors` (d, n), `scores` (n) and
-`image_size` (2), and where the detector tells them `scales` (n) and `oris` (n).
+`image_size` (2), and where the detector tells them `scales` (n) and `oris` (n): in radians, while hloc's own
+are in degrees, which is told by their being larger than a turn.
 `matches.h5`: a group `A/B` a pair of image names ("/" in a name written "-") with
 `matches0` (for each keypoint of A its match in B or -1) and `matching_scores0`.
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 _PIXEL_CENTER = np.float32(0.5)
 _INT16_MAX = np.iinfo(np.int16).max
+_TURN = 2 * np.pi + 0.01  # half floats round
 
 
 class FeatureFile(Mapping[str, Features]):
@@ -101,7 +103,10 @@ def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, 
     frames = np.stack([read_array(file, f"{name}/{part}") for part in ("scales", "oris")], axis=1)
     if frames.shape != (count, 2):
         raise ValueError(f"{count} keypoints with scales and oris of shape {frames.shape}")
-    return frames.astype(np.float32)
+    frames = frames.astype(np.float32)
+    if np.any(np.abs(frames[:, 1]) > _TURN):
+        frames[:, 1] = np.radians(frames[:, 1])
+    return frames
 
 
 class MatchFile(Mapping[tuple[str, str], IndexPairs]):

@@ -136,14 +136,14 @@ def _load(path: Path, method: str, threads: int, _size: int, _changed: int) -> R
 
 def _check_origin(path: Path, method: str, origin: dict[str, str]) -> None:
     if origin.get(_METHOD) != method:
-        raise InputError(f"{path}: was not made by slimsfm export {method}; {_anew(method)}")
+        raise InputError(f"{path}: was not made by slimsfm export onnx {method}; {_anew(method)}")
     here = _checksum(method)
     if here and origin.get(_WEIGHTS) and here != origin[_WEIGHTS]:
         raise InputError(f"{path}: was made of other weights than {WEIGHTS[method].file}; {_anew(method)}")
 
 
 def _anew(method: str) -> str:
-    return f"remove it, or make it anew by slimsfm export {method}"
+    return f"remove it, or make it anew by slimsfm export onnx {method}"
 
 
 def _checksum(method: str) -> str:

@@ -1,0 +1,125 @@
+"""A map as hloc reads it.
+
+OUT/
+  sfm/                COLMAP model; keypoint i of an image in it is row i of its features
+  features.h5         the images' features
+  matches.h5          verified matches of pairs of images; where the map has any
+  references.txt      names of the images, one a line
+  pairs-queries.txt   `query reference`, one pair a line; where queries are named
+
+hloc multiplies descriptors as they are stored, so bytes become half floats of unit length, and it measures
+orientations in degrees. Keypoints stay single floats: hloc's half ones are off by up to a quarter of a pixel
+beyond column 512, and by a half beyond 1024.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from slimsfm.errors import InputError, MapError
+from slimsfm.features import Features, unit_rows
+from slimsfm.features.store import FeatureWriter, write_matches
+from slimsfm.files import replacing
+from slimsfm.mapping.map import Map, check_count
+from slimsfm.photos import list_images
+
+
+def write_hloc(map: Map, path: Path, queries: Iterable[str] = (), *, overwrite: bool = False) -> None:
+    """Write a folder that hloc's `match_features` and `localize_sfm` run on.
+
+    Args:
+        map: A map whose images have features.
+        path: The folder.
+        queries: Names of queries: each is paired with every image of the map.
+        overwrite: Replace what is there.
+
+    Raises:
+        MapError: The map is for direct matching alone.
+        InputError: A query is called as an image of the map is, or a name in a pair holds a space.
+        OutputError: The place is taken and `overwrite` is off, or cannot be written.
+    """
+    if map.is_for_direct_matching:
+        raise MapError(
+            "the map is for direct matching alone, and hloc matches images; "
+            "reduce the full map by `slimsfm reduce MAP -o SMALL --for images`"
+        )
+    pairs = _pairs(queries, map)
+    with replacing(path, overwrite=overwrite) as partial:
+        (partial / "sfm").mkdir(parents=True)
+        map.model.write(partial / "sfm")
+        _write_features(map, partial / "features.h5")
+        if map.matches:
+            counts = {name: image.num_points2D() for name, image in map.images.items()}
+            write_matches(partial / "matches.h5", map.matches, counts)
+        _write_lines(partial / "references.txt", map.images)
+        if pairs:
+            _write_lines(partial / "pairs-queries.txt", (f"{query} {name}" for query, name in pairs))
+
+
+def read_query_names(path: Path) -> list[str]:
+    """Read the names of queries: a folder of images, or a text file with a line for each.
+
+    Args:
+        path: In a file, a line is a name, or `NAME MODEL WIDTH HEIGHT PARAMS...` as hloc's lists have it.
+
+    Raises:
+        InputError: It is missing or holds no name, or a line is neither.
+    """
+    if path.is_dir():
+        return list_images(path)
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: neither a folder of images nor a readable list of names") from error
+    names = [_name(line, path) for line in lines if line.strip() and not line.startswith("#")]
+    if not names:
+        raise InputError(f"{path}: names no query")
+    return list(dict.fromkeys(names))
+
+
+def _name(line: str, path: Path) -> str:
+    name, *camera = line.split()
+    if camera and camera[0] not in pycolmap.CameraModelId.__members__:
+        raise InputError(
+            f"{path}: {line.strip()!r} is neither a name without spaces "
+            "nor `NAME MODEL WIDTH HEIGHT PARAMS...`"
+        )
+    return name
+
+
+def _pairs(queries: Iterable[str], map: Map) -> list[tuple[str, str]]:
+    pairs = [(query, name) for query in queries for name in map.images]
+    for name in dict.fromkeys(name for pair in pairs for name in pair):
+        if len(name.split()) > 1:
+            raise InputError(f"{name!r}: hloc reads no pair of a name with a space; rename the image")
+    for query, _ in pairs:
+        if query in map.images:
+            raise InputError(
+                f"query {query!r} is called as an image of the map is, and hloc tells images by name alone; "
+                "list only the queries"
+            )
+    return pairs
+
+
+def _write_features(map: Map, path: Path) -> None:
+    with FeatureWriter(path) as writer:
+        for name, image in map.images.items():
+            features = map.features[name]
+            check_count(image, len(features))
+            writer.write(name, _as_in_hloc(features))
+
+
+def _as_in_hloc(features: Features) -> Features:
+    descriptors, frames = features.descriptors, features.frames
+    if not np.issubdtype(descriptors.dtype, np.floating):
+        descriptors = unit_rows(descriptors).astype(np.float16)
+    if frames is not None:
+        frames = np.stack([frames[:, 0], np.degrees(frames[:, 1])], axis=1)
+    return replace(features, descriptors=descriptors, frames=frames)
+
+
+def _write_lines(path: Path, lines: Iterable[str]) -> None:
+    path.write_text("".join(f"{line}\n" for line in lines))
