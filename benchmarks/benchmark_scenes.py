@@ -5,13 +5,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from slimsfm.cli import run
 from slimsfm.cli.output import quiet
-from slimsfm.datasets.images import hold_out, query_names
+from slimsfm.datasets.base import Making
+from slimsfm.datasets.images import Images
 from slimsfm.datasets.mapping import map_object
 from slimsfm.datasets.onepose import read_object
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
-from slimsfm.evaluation.protocol import PreparedQuery, held_out_queries, prepare, queries_of
+from slimsfm.evaluation.protocol import PreparedQuery, prepare, queries_of
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
@@ -30,13 +30,12 @@ class Scene:
 def scenes(folders: list[Path], objects: Sequence[str], output: Path) -> Iterator[Scene]:
     """The folders of photos, then the rendered objects; what is made is kept in the output folder."""
     for folder in folders:
-        results = output / folder.name
-        if not (results / "pseudo-ground-truth").exists():
-            run(["benchmark", "images", str(folder), "-o", str(results), "--variants", "full"])
-        truth = read_map(results / "pseudo-ground-truth")
-        names = query_names(list(truth.images), 3)
-        queries = held_out_queries(truth, folder, names)
-        write_map(hold_out(truth, names), output / f"{folder.name}-map", overwrite=True)
+        with quiet():
+            making = Making(folder=output / folder.name, progress=shown)
+            photos = Images(path=folder).load(folder.resolve().name, making)
+            made = map_object(photos, output / "workspace")
+        queries = queries_of(photos.query)
+        write_map(made, output / f"{folder.name}-map", overwrite=True)
         references = read_map(output / f"{folder.name}-map")
         size = bytes_by_part(output / f"{folder.name}-map")["total"]
         yield Scene(name=folder.name, references=references, bytes=size, queries=prepare(references, queries))
@@ -51,7 +50,7 @@ def rendered(name: str, output: Path) -> Scene:
     made = read_object(output / "objects" / name)
     if not (output / f"{name}-map").exists():
         with quiet(), tempfile.TemporaryDirectory() as workspace:
-            write_map(map_object(made, Path(workspace), progress=shown).map, output / f"{name}-map")
+            write_map(map_object(made, Path(workspace), progress=shown), output / f"{name}-map")
     references = read_map(output / f"{name}-map")
     queries = queries_of(made.query)
     size = bytes_by_part(output / f"{name}-map")["total"]

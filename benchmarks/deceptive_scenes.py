@@ -9,6 +9,7 @@ import argparse
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -19,7 +20,8 @@ from PIL import Image as PilImage
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
 from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import Label, evaluate, prepare, queries_of
+from slimsfm.evaluation.protocol import evaluate, prepare, queries_of
+from slimsfm.evaluation.scores import score
 from slimsfm.execution import processes
 from slimsfm.files import replacing
 from slimsfm.mapping import read_map, write_map
@@ -49,7 +51,7 @@ def deception(name: str, output: Path, *, workers: int = 1) -> Scene:
     made = onepose.read_object(folder)
     if not path.exists():
         with quiet(), tempfile.TemporaryDirectory() as workspace:
-            write_map(map_object(made, Path(workspace), progress=shown).map, path)
+            write_map(map_object(made, Path(workspace), progress=shown), path)
     references = read_map(path)
     queries = prepare(references, queries_of(made.query))
     return Scene(name=name, references=references, bytes=bytes_by_part(path)["total"], queries=queries)
@@ -92,13 +94,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("-o", "--output", required=True, type=Path)
     for scene in deceptions(parser.parse_args().output):
-        row = evaluate(
-            scene.references,
-            scene.queries,
-            Label(object=scene.name, strategy="exhaustive", variant="full"),
-            map_bytes=scene.bytes,
-        )
-        print(scene.name, row.to_json())
+        outcomes = evaluate(scene.references, scene.queries, "exhaustive")
+        print(scene.name, asdict(score(outcomes, metric=True)))
 
 
 if __name__ == "__main__":

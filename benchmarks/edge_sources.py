@@ -15,7 +15,7 @@ from benchmark_scenes import Scene, scenes
 
 from slimsfm.domination import DominationProblem, exact
 from slimsfm.evaluation.metrics import add_percent
-from slimsfm.evaluation.protocol import errors_of, localize_all
+from slimsfm.evaluation.protocol import evaluate
 from slimsfm.graph import GraphOptions, GraphRun, compute_graph
 from slimsfm.graph.candidates import all_pairs, likely_pairs
 from slimsfm.mapping import Map, keep_images
@@ -53,7 +53,7 @@ def describe(scene: Scene, one: GraphRun, paper: GraphRun) -> str:
     too_many = (ours & ~theirs & off).sum() / max((ours & off).sum(), 1)
     chosen = exact(DominationProblem(one.graph.adjacency(THRESHOLD))).chosen
     slim = keep_images(scene.references, [one.graph.names[i] for i in chosen])
-    errors = errors_of(slim, scene.queries, localize_all(slim, scene.queries, "exhaustive"))
+    errors = evaluate(slim, scene.queries, "exhaustive").error
     return (
         f"{seconds(one):.2f} s, {seconds(paper) / seconds(one):.1f} times faster than localize; "
         f"{100 * (ours == theirs)[off].mean():.2f} % of decisions equal, {100 * too_many:.2f} % of edges "

@@ -18,6 +18,7 @@ from jaxtyping import Float64
 from PIL import Image as PilImage
 
 from slimsfm.datasets import onepose
+from slimsfm.datasets.base import PosedSequence
 from slimsfm.files import replacing
 from slimsfm.synthetic.film import Film, film
 
@@ -28,7 +29,7 @@ NAME, FRAMES, WIDTH, HEIGHT, SEED = "printed_box", 600, 640, 480, 0
 class FilmFrames:
     """The frames of the film as files, and what is known of them."""
 
-    sequence: onepose.PosedSequence
+    sequence: PosedSequence
     """Image files, camera and true poses, in the frame of the object."""
 
     visible: Float64[np.ndarray, " frames"]

@@ -21,10 +21,12 @@ from benchmark_scenes import rendered
 from random_weights import write_random_weights
 
 from slimsfm.cli.output import quiet
+from slimsfm.datasets.base import ObjectSequences
 from slimsfm.datasets.mapping import map_object
-from slimsfm.datasets.onepose import ObjectSequences, read_object
-from slimsfm.evaluation.protocol import Label, PreparedQuery, evaluate, prepare, queries_of, row_of
-from slimsfm.evaluation.table import Row, mean_row
+from slimsfm.datasets.onepose import read_object
+from slimsfm.evaluation.outcomes import Outcomes, join, outcomes_of
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
+from slimsfm.evaluation.scores import Scores, score
 from slimsfm.features import Features
 from slimsfm.features.image_matching import load_image_matcher
 from slimsfm.features.superpoint import SuperPoint
@@ -127,7 +129,7 @@ def _built(made: ObjectSequences, method: Method) -> Map:
     matcher = "superglue" if method.extractor == "superpoint" else "nearest"
     with quiet(), tempfile.TemporaryDirectory() as workspace:
         options = BuildOptions(extractor=method.extractor, matcher=matcher)
-        return map_object(made, Path(workspace), options).map
+        return map_object(made, Path(workspace), options)
 
 
 def _described(map_: Map, made: ObjectSequences, extractor: str) -> Map:
@@ -163,6 +165,15 @@ def _by_loftr() -> Describe:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """How one method does on one variant of a map."""
+
+    references: float
+    points: float
+    scores: Scores
+
+
 def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count: int) -> dict[str, Row]:
     graph = compute_graph(map_, GraphOptions(edges="matches")).graph
     names, chosen = list(map_.images), dominating_set(graph, ReductionOptions()).chosen
@@ -174,21 +185,25 @@ def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count:
     step = max(1, len(made.query.image_paths) // count)
     queries, rows = prepare(map_, queries_of(made.query)[::step][:count]), {}
     for variant, maps in variants.items():
-        label = Label(object="", strategy=method.strategy, matcher=method.matcher, variant=variant)
         stored = [_stored(one, output / "map") for one in maps]
-        run = _row_of_boxes if method.is_box_given else evaluate
-        rows[variant] = mean_row([run(one, queries, label, map_bytes=0) for one in stored])
+        run = _with_boxes if method.is_box_given else evaluate
+        outcomes = [run(one, queries, method.strategy, method.matcher) for one in stored]
+        rows[variant] = Row(
+            references=float(np.mean([len(one.images) for one in stored])),
+            points=float(np.mean([len(one.point3D_ids) for one in stored])),
+            scores=score(join(outcomes), metric=True, trials=len(stored)),
+        )
     return rows
 
 
-def _row_of_boxes(map_: Map, queries: list[PreparedQuery], label: Label, *, map_bytes: int) -> Row:
+def _with_boxes(map_: Map, queries: list[PreparedQuery], strategy: str, _matcher: str) -> Outcomes:
     """Localize queries near their true poses, after one that is not timed."""
-    localizer = Localizer(map_, LocalizationOptions(strategy=label.strategy))
+    localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
     found = [
         localizer.localize_near(read_image(one.path), one.camera, one.cam_from_world)
         for one in (prepared.query for prepared in (queries[0], *queries))
     ][1:]
-    return row_of(map_, queries, found, label, map_bytes=map_bytes)
+    return outcomes_of(found, [one.query.cam_from_world for one in queries], map_.box)
 
 
 def _stored(map_: Map, path: Path) -> Map:

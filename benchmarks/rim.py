@@ -27,7 +27,7 @@ from slimsfm.cli import run
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
 from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import PreparedQuery, errors_of, localize_all, prepare, queries_of
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import ReferenceGraph, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
@@ -123,7 +123,7 @@ def captured(name: str, shape: str, output: Path) -> Capture:
         shutil.rmtree(folder, ignore_errors=True)
         render_object(folder / name, name, shape)
         with tempfile.TemporaryDirectory() as workspace, quiet():
-            write_map(map_object(onepose.read_object(folder / name), Path(workspace)).map, folder / "map")
+            write_map(map_object(onepose.read_object(folder / name), Path(workspace)), folder / "map")
     map_ = read_map(folder / "map")
     queries = prepare(map_, queries_of(onepose.read_object(folder / name).query))
     graph = compute_graph(map_).graph
@@ -165,8 +165,7 @@ def measured(capture: Capture) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
     rows: dict[tuple[str, str], np.ndarray] = {}
     for choice, (map_, strategies) in maps_of(capture):
         for strategy in strategies:
-            found = errors_of(map_, capture.queries, localize_all(map_, capture.queries, strategy))
-            rows[choice, strategy] = np.array([error.relative_corner_error for error in found])
+            rows[choice, strategy] = evaluate(map_, capture.queries, strategy).error
             yield (choice, strategy), rows[choice, strategy]
         print(f"  {choice}: {len(map_.images)} images, {len(map_.point3D_ids)} points")
     summarize(rows)

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from benchmark_scenes import Scene, scenes
 
-from slimsfm.evaluation.protocol import Label, evaluate
+from slimsfm.evaluation.protocol import evaluate
+from slimsfm.evaluation.scores import score
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
 from slimsfm.mapping.io import bytes_by_part, weigh_map
@@ -143,10 +144,8 @@ def tried(
     seed: int = 0,
 ) -> Result:
     """Localize all queries of a scene."""
-    row = evaluate(
-        map_, scene.queries, Label(object=scene.name, strategy=strategy, variant=method), map_bytes=size
-    )
-    seconds = row.scores.seconds
+    scores = score(evaluate(map_, scene.queries, strategy), metric=False)
+    seconds = scores.seconds
     return Result(
         scene=scene.name,
         method=method,
@@ -155,8 +154,8 @@ def tried(
         images=len(map_.images) if map_.features else 0,
         points=len(map_.point3D_ids),
         bytes=size,
-        add=tuple(row.scores.add.values()),
-        median=row.scores.median_corner_error,
+        add=tuple(scores.add.values()),
+        median=scores.median_error,
         ms=1e3 * (seconds.match + seconds.pose),
         foretold=foretold.within(0.1) if foretold and foretold.tests else None,
     )

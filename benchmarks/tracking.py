@@ -125,7 +125,7 @@ def each_alone(film: FilmFrames, video: Path, full: Map) -> Float64[np.ndarray, 
     pairs = list(zip(images_of(video), truth_of(film), strict=True))
     return np.array(
         [
-            error_of(localizer.localize(image, film.sequence.camera).pose, truth, full.box)
+            error_of(localizer.localize(image, film.sequence.cameras[0]).pose, truth, full.box)
             for image, truth in shown(pairs, "each alone")
         ]
     )
@@ -137,7 +137,7 @@ def tracked(film: FilmFrames, video: Path, map_: Map, options: TrackerOptions) -
     results, seconds, cpu = [], [], process_time()
     last = perf_counter()
     for image in images_of(video):
-        results.append(tracker.track(image, film.sequence.camera))
+        results.append(tracker.track(image, film.sequence.cameras[0]))
         now = perf_counter()
         seconds.append(now - last)
         last = now
@@ -213,7 +213,7 @@ def draw(video: Path, ran: Run, film: FilmFrames, box: Box, path: Path) -> None:
         for image, one in zip(images_of(video), ran.results, strict=True):
             drawn = image.copy()
             if one.pose:
-                pose, camera = one.pose.cam_from_world, film.sequence.camera
+                pose, camera = one.pose.cam_from_world, film.sequence.cameras[0]
                 draw_box(drawn, box, pose, camera, ESTIMATED_RGB, thickness=2)
             write(drawn)
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from commands import Outcome, slimsfm
 from slimsfm.cli.output import quiet
+from slimsfm.datasets.base import PosedSequence
 from slimsfm.datasets.mapping import map_object
-from slimsfm.datasets.onepose import PosedSequence, read_object
+from slimsfm.datasets.onepose import read_object
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
 
@@ -31,11 +32,11 @@ class Rendered:
 
     @property
     def photos(self) -> Path:
-        return self.mapping.image_paths[0].parent
+        return self.mapping.folder
 
     @property
     def queries(self) -> Path:
-        return self.query.image_paths[0].parent
+        return self.query.folder
 
 
 @cache
@@ -46,5 +47,5 @@ def rendered(folder: Path) -> Rendered:
     assert outcome.code == 0, outcome.err
     made = read_object(folder / "objects" / NAME)
     with tempfile.TemporaryDirectory() as workspace, quiet():
-        write_map(map_object(made, Path(workspace)).map, folder / "map")
+        write_map(map_object(made, Path(workspace)), folder / "map")
     return Rendered(folder, outcome, made.mapping, made.query, folder / "map")

@@ -222,7 +222,7 @@ def test_bad_options_of_localize(refused, boulder, tmp_path, arguments, naming):
         (
             "benchmark images",
             ("--strategies", "guess"),
-            "strategies must be among direct, exhaustive, onepose, onepose++, progressive, ",
+            "strategy must be auto or one of direct, exhaustive, onepose, onepose++, progressive, ",
         ),
         ("benchmark images", ("--variants", "half"), "variants must be among"),
         ("benchmark images", ("--query-every", "0"), "--query-every 0"),

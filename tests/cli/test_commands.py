@@ -14,7 +14,6 @@ from commands import contents, slimsfm
 from rendered import MAPPING_FRAMES, NAME, QUERY_FRAMES
 from slimsfm.cli import COMMANDS
 from slimsfm.domination import dominates
-from slimsfm.evaluation.variants import VARIANTS
 from slimsfm.geometry import corner_error
 from slimsfm.graph.io import graph_of
 from slimsfm.mapping.io import read_map
@@ -128,7 +127,7 @@ def test_localize_references_in_full_and_slim_map(boulder, tmp_path, strategy):
 
 
 def test_localize_one_image_with_its_camera(boulder, tmp_path):
-    camera = boulder.mapping.camera
+    camera = boulder.mapping.cameras[0]
     line = f"1 {camera.model_name} {camera.width} {camera.height} {' '.join(map(str, camera.params))}\n"
     (tmp_path / "camera.txt").write_text(line)
     one, output = boulder.photos / "12.png", tmp_path / "pose.csv"
@@ -223,33 +222,6 @@ def test_import_brings_the_model_back(boulder, tmp_path):
     assert_done(done, tmp_path / "map", "reduce")
     assert list(read_map(tmp_path / "map").images) == list(boulder.map.images)
     assert len(read_map(tmp_path / "map").point3D_ids) == len(boulder.map.point3D_ids)
-
-
-def test_benchmark_of_a_folder_of_photos(boulder, tmp_path):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for path in boulder.mapping.image_paths[8:24]:
-        shutil.copy(path, photos / f"{int(path.stem):02d}.png")
-    output = tmp_path / "results"
-    done = slimsfm("benchmark", "images", photos, "-o", output, "--strategies", "direct", "--query-every", 4)
-    assert_done(done, output / "results.json", "reduce")
-    results = json.loads((output / "results.json").read_text())
-    rows = results["rows"]
-    assert [(row["strategy"], row["variant"]) for row in rows] == [
-        ("direct", variant) for variant in VARIANTS
-    ]
-    truth = read_map(output / "pseudo-ground-truth")
-    queries = sorted(truth.images)[::4]
-    assert {row["queries"] for row in rows} == {len(queries)}
-    about = results["objects"]["photos"]
-    assert about["references"] == rows[0]["references"] == len(truth.images) - len(queries)
-    assert len(about["dominating_set"]) == rows[1]["references"] >= about["lower_bound"]
-    assert not set(about["dominating_set"]) & set(queries)
-    assert results["options"]["strategies"] == ["direct"]
-    before = contents(output / "pseudo-ground-truth")
-    again = slimsfm("benchmark", "images", photos, "-o", output, "--strategies", "direct", "--query-every", 4)
-    assert again.code == 0
-    assert contents(output / "pseudo-ground-truth") == before
 
 
 def test_overwrite_replaces_the_whole_map(boulder, tmp_path):

@@ -1,152 +1,234 @@
+import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from scenes import algorithm_1, camera, exact_map
+from slimsfm.datasets.base import ObjectModel, ObjectSequences, PosedSequence
 from slimsfm.domination import dominates
-from slimsfm.evaluation.benchmark import BenchmarkOptions, benchmark
-from slimsfm.evaluation.protocol import (
-    Label,
-    PreparedQuery,
-    Query,
-    errors_of,
-    evaluate,
-    localize_all,
-    prepare,
-)
+from slimsfm.evaluation.benchmark import Bench, BenchmarkOptions, benchmark_object, graph_options
+from slimsfm.evaluation.methods import parse_method
+from slimsfm.evaluation.protocol import evaluate, prepare
+from slimsfm.evaluation.results import map_path
+from slimsfm.evaluation.table import rows_of
+from slimsfm.geometry import corner_error
+from slimsfm.graph.io import graph_of
+from slimsfm.mapping.build import BuildOptions
+from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.reduction import ReductionOptions, keep_random_images
-from strategies import CLASSICAL
+
+OPTIONS = BenchmarkOptions(strategies=("exhaustive", "direct"))
+SPAN, QUERIES = range(12, 22), (14, 19)
 
 
-@pytest.fixture(scope="module")
-def narrow():
-    return exact_map(num_images=10, reach_deg=65.0)
-
-
-@pytest.fixture(scope="module")
-def graph(narrow):
-    return algorithm_1(narrow)
-
-
-@pytest.fixture
-def queries(narrow, tmp_path):
-    """The references themselves, whose features are known and so need no file."""
-    return [
-        PreparedQuery(
-            query=Query(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
-            features=narrow.features[name],
-            extract_seconds=0.25,
-        )
-        for name, image in narrow.images.items()
-    ]
-
-
-@pytest.fixture
-def stored():
-    return {}
-
-
-@pytest.fixture
-def store(stored):
-    def keep(map_, name):
-        stored[name] = map_
-        return map_, 1000 * len(map_.images)
-
-    return keep
-
-
-def weigh(map_):
-    return 100 * len(map_.point3D_ids)
-
-
-def test_a_benchmark_of_an_exact_scene(narrow, graph, queries, stored, store):
-    result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh)
-    labels = [(row.strategy, row.variant) for row in result.rows]
-    images = ["full", "dominating", "random"]
-    by_images = [(s, v) for s in ("exhaustive", "retrieval", "progressive") for v in images]
-    assert labels == by_images + [("direct", v) for v in [*images[:2], "default", images[2]]]
-    count = len(result.solution.chosen)
-    assert dominates(graph.adjacency(), result.solution.chosen)
-    for row in result.rows:
-        assert row.object == "exact"
-        assert row.references == (10 if row.variant in ("full", "default") else count)
-        assert row.map_bytes == 1000 * row.references
-        assert row.scores.queries == 10
-        assert row.scores.seconds.extract == 0.25
-        if row.variant != "random":  # a dominating set localizes every image, here without error
-            assert row.scores.localized == 100.0
-            assert row.scores.add == {0.1: 100.0, 0.05: 100.0, 0.02: 100.0}
-            assert row.scores.deg_cm == {1: 100.0, 3: 100.0, 5: 100.0}
-            assert row.scores.median_corner_error < 1e-4
-    assert set(stored) == {"full-0", "dominating-0", "default-0", *(f"random-{i}" for i in range(5))}
-    assert stored["default-0"].is_for_direct_matching
-    assert len(stored["default-0"].point3D_ids) < len(narrow.point3D_ids)
-    assert list(stored["dominating-0"].images) == [graph.names[i] for i in result.solution.chosen]
-
-
-def test_random_variants_are_the_five_seeds_and_their_row_the_mean(narrow, graph, queries, stored, store):
-    options = BenchmarkOptions(strategies=("direct",), variants=("random",))
-    result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh, options=options)
-    (row,) = result.rows
-    count = len(result.solution.chosen)
-    draws = [keep_random_images(narrow, count, seed=seed) for seed in range(5)]
-    assert [list(stored[f"random-{i}"].images) for i in range(5)] == [list(one.images) for one in draws]
-    found = [
-        evaluate(one, queries, Label(object="exact", strategy="direct", variant="random"), map_bytes=1)
-        for one in draws
-    ]
-    assert row.scores.localized == pytest.approx(sum(one.scores.localized for one in found) / 5)
-    assert row.points == pytest.approx(sum(one.points for one in found) / 5)
-
-
-def test_the_threshold_of_the_reduction_is_obeyed(narrow, graph, queries, store):
-    strict = BenchmarkOptions(
-        strategies=("direct",), variants=("dominating",), reduction=ReductionOptions(threshold=1e-12)
+def frames_of(sequence, numbers):
+    chosen = [sequence.names.index(f"{number}.png") for number in numbers]
+    return PosedSequence(
+        folder=sequence.folder,
+        names=tuple(sequence.names[i] for i in chosen),
+        cameras=tuple(sequence.cameras[i] for i in chosen),
+        cam_from_world=tuple(sequence.cam_from_world[i] for i in chosen),
     )
-    result = benchmark(narrow, graph, queries, name="exact", store=store, weigh=weigh, options=strict)
-    assert len(result.solution.chosen) == 10
 
 
-def test_a_map_of_unknown_unit_has_no_centimetres(narrow, queries):
-    unknown = replace(narrow, info=replace(narrow.info, unit="unknown"))
-    row = evaluate(unknown, queries, Label(object="exact", strategy="direct", variant="full"), map_bytes=1)
-    assert row.scores.deg_cm is None
-    assert row.scores.localized == 100.0
+@pytest.fixture(scope="module")
+def sequences(boulder):
+    """Ten neighbouring frames of the rendered object, two of them queries, whose map is yet to be built."""
+    return ObjectSequences(
+        name="boulder",
+        mapping=frames_of(boulder.mapping, [one for one in SPAN if one not in QUERIES]),
+        query=frames_of(boulder.mapping, QUERIES),
+        box=boulder.map.box,
+    )
 
 
-@pytest.mark.parametrize("strategy", CLASSICAL)
-def test_queries_come_back_in_order_and_no_query_is_refused(narrow, queries, strategy):
-    errors = errors_of(narrow, queries, localize_all(narrow, queries, strategy))
-    assert len(errors) == 10
-    assert max(error.relative_corner_error for error in errors) < 1e-4
-    with pytest.raises(ValueError, match="queries must hold at least one"):
-        localize_all(narrow, [], strategy)
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    return Bench(folder=tmp_path_factory.mktemp("benchmark") / "run", options=OPTIONS)
 
 
-def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
-    map_, sequence = boulder.map, boulder.mapping
-    queries = [
-        Query(path=path, camera=sequence.camera, cam_from_world=pose)
-        for path, pose in zip(sequence.image_paths[:3], sequence.cam_from_world, strict=False)
+@pytest.fixture(scope="module")
+def result(sequences, bench):
+    return benchmark_object(sequences, bench)
+
+
+def kept(bench, variant):
+    return map_path(bench.folder, "boulder", "sift", variant)
+
+
+def test_there_is_a_line_of_every_strategy_and_every_variant_that_it_can_use(result):
+    images, points = ["full", "dominating", "random"], ["full", "dominating", "default", "random"]
+    assert [cell.key for cell in result.cells] == [
+        *(("sift", "exhaustive", variant) for variant in images),
+        *(("sift", "direct", variant) for variant in points),
     ]
-    for query, prepared in zip(queries, prepare(map_, queries), strict=True):
-        stored = map_.features[query.path.name]
-        assert (prepared.features.keypoints == stored.keypoints).all()
-        assert (prepared.features.descriptors == stored.descriptors).all()
-        assert prepared.extract_seconds > 0
+    assert [len(cell.trials) for cell in result.cells] == [1, 1, 5, 1, 1, 1, 5]
+
+
+def test_the_object_is_told_as_it_was_given(result, sequences):
+    assert (result.name, result.unit, result.images) == ("boulder", "metre", sequences.mapping.folder)
+    assert result.box is sequences.box
+    assert [query.path for query in result.queries] == list(sequences.query.image_paths)
+    assert [query.cam_from_world for query in result.queries] == list(sequences.query.cam_from_world)
+
+
+def test_queries_are_localized_well_against_the_full_map(result):
+    for strategy in OPTIONS.strategies:
+        outcomes = result.cell("sift", strategy, "full").outcomes
+        assert (outcomes.error < 0.02).all()
+        assert (outcomes.confidence > 0.5).all()
+
+
+def test_errors_are_those_of_the_poses(result):
+    for cell in result.cells:
+        for trial in cell.trials:
+            for pose, error, query in zip(
+                trial.outcomes.cam_from_world, trial.outcomes.error, result.queries, strict=True
+            ):
+                expected = corner_error(pose, query.cam_from_world, result.box) if pose else np.inf
+                assert error == expected
+
+
+def test_the_dominating_set_dominates_the_graph_that_is_kept(result, bench):
+    (mapped,) = result.maps
+    path = kept(bench, "full")
+    full = read_map(path)
+    labels = []
+
+    def watch(items, label):
+        labels.append(label)
+        return iter(items)
+
+    graph = graph_of(full, path, graph_options(OPTIONS, parse_method("sift")), progress=watch).graph
+    assert labels == []  # read, not computed
+    chosen = [graph.names.index(name) for name in mapped.dominating_set]
+    assert dominates(graph.adjacency(), chosen)
+    assert mapped.lower_bound == len(chosen) < mapped.references == len(full.images) == 8
+    assert mapped.edges == graph.num_edges(0.05)
+    assert mapped.points == len(full.point3D_ids)
+
+
+def test_maps_are_kept_and_are_those_that_were_measured(result, bench):
+    assert {path.name for path in kept(bench, "full").parent.iterdir()} == {"full", "dominating", "default"}
+    for variant in ("full", "dominating", "default"):
+        (trial,) = result.cell("sift", "direct", variant).trials
+        made = read_map(kept(bench, variant))
+        assert (trial.references, trial.points) == (len(made.images), len(made.point3D_ids))
+        assert trial.map_bytes == bytes_by_part(kept(bench, variant))["total"]
+    (mapped,) = result.maps
+    assert list(read_map(kept(bench, "dominating")).images) == list(mapped.dominating_set)
+    assert result.cell("sift", "direct", "dominating").trials[0].points == mapped.dominating_points
+    assert read_map(kept(bench, "default")).is_for_direct_matching
+
+
+def test_random_rows_are_the_mean_over_the_five_seeds(result, bench):
+    full, count = read_map(kept(bench, "full")), len(result.maps[0].dominating_set)
+    prepared = prepare(full, list(result.queries))
+    cell = result.cell("sift", "direct", "random")
+    found = []
+    for seed, trial in enumerate(cell.trials):
+        drawn = keep_random_images(full, count, seed=seed)
+        assert (trial.references, trial.points) == (count, len(drawn.point3D_ids))
+        outcomes = evaluate(drawn, prepared, "direct")
+        assert outcomes.error == pytest.approx(trial.outcomes.error)
+        found.append(outcomes.error)
+    row = rows_of(result)[-1]
+    assert (row.strategy, row.variant, row.scores.queries) == ("direct", "random", 2)
+    assert row.scores.add[0.1] == pytest.approx(100 * np.mean(np.array(found) < 0.1))
+    assert row.points == pytest.approx(np.mean([trial.points for trial in cell.trials]))
+    assert row.map_bytes == pytest.approx(np.mean([trial.map_bytes for trial in cell.trials]))
+
+
+def test_features_of_a_query_are_found_once_for_all_lines(result):
+    extract = [trial.outcomes.seconds[:, 0].tolist() for cell in result.cells for trial in cell.trials]
+    assert all(one == extract[0] for one in extract)
+    assert min(extract[0]) > 0
+    assert all((trial.outcomes.seconds > 0).all() for cell in result.cells for trial in cell.trials)
+
+
+@pytest.fixture
+def again(bench, result, tmp_path):
+    """Measures the object with other options, from the map that is there already."""
+    assert result.maps
+    shutil.copytree(kept(bench, "full"), map_path(tmp_path, "boulder", "sift", "full"))
+
+    def measure(sequences, **options):
+        options = {"strategies": ("direct",), "variants": ("dominating",)} | options
+        return benchmark_object(sequences, Bench(folder=tmp_path, options=BenchmarkOptions(**options)))
+
+    return measure
+
+
+def test_the_threshold_of_the_reduction_is_obeyed(again, sequences):
+    found = again(sequences, reduction=ReductionOptions(threshold=1e-12))
+    assert len(found.maps[0].dominating_set) == found.maps[0].references == 8
+    assert found.maps[0].edges == 0
+
+
+def test_an_object_with_a_model_is_measured_by_its_vertices(again, sequences, result):
+    """One vertex, where the box is far from it: its distance over the diameter."""
+    far = np.array([[0.0, 0.0, 3.0]])
+    model = ObjectModel(vertices=far, diameter=2.0, symmetric=False)
+    found = again(replace(sequences, model=model))
+    outcomes = found.cells[0].outcomes
+    for pose, error, query in zip(outcomes.cam_from_world, outcomes.error, found.queries, strict=True):
+        if pose is not None:
+            assert error == pytest.approx(np.linalg.norm(pose * far - query.cam_from_world * far) / 2)
+    before = result.cell("sift", "direct", "dominating").outcomes
+    assert [pose is None for pose in outcomes.cam_from_world] == [
+        pose is None for pose in before.cam_from_world
+    ]
+    assert not np.array_equal(outcomes.error, before.error)
+
+
+def test_random_variants_of_several_sizes_do_not_get_into_each_others_way(again, sequences):
+    """They lie at temporary places, and a map reads its features when it needs them."""
+    both = again(sequences, variants=("random:2", "random:3"))
+    for cell in both.cells:
+        count = int(cell.variant[-1])
+        assert [trial.references for trial in cell.trials] == [count] * 5
+        (alone,) = again(sequences, variants=(cell.variant,)).cells
+        for one, other in zip(cell.trials, alone.trials, strict=True):
+            assert one.outcomes.error.tolist() == other.outcomes.error.tolist()
+
+
+def test_maps_are_built_with_the_features_of_the_method(tmp_path):
+    bench = Bench(folder=tmp_path, options=OPTIONS, build=BuildOptions(max_features=500, matcher="lightglue"))
+    built = bench.build_with(parse_method("aliked+superglue"))
+    assert (built.extractor, built.matcher, built.max_features) == ("aliked", "superglue", 500)
+    assert bench.build_with(parse_method("aliked")).matcher == "lightglue"
+    assert bench.dataset_making("toy").folder == tmp_path / "truth" / "toy"
+
+
+def test_graphs_are_matched_as_the_method_says():
+    options = BenchmarkOptions(edges="hybrid", reduction=ReductionOptions(threshold=0.02))
+    found = graph_options(options, parse_method("aliked+lightglue"))
+    assert (found.edges, found.candidates, found.threshold, found.matcher) == (
+        *("hybrid", "all"),
+        *(0.02, "lightglue"),
+    )
+    assert graph_options(options, parse_method("sift")).matcher == "auto"
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (
-            {"strategies": ("direct", "guess")},
-            "strategies must be among direct, exhaustive, .*, retrieval, got direct, guess",
-        ),
-        ({"strategies": ()}, "strategies must be among .* got none"),
-        ({"variants": ("half",)}, "variants must be among full, dominating, default, random, got half"),
+        ({"strategies": ("direct", "guess")}, "strategy must be auto or one of .*, got 'guess'"),
+        ({"strategies": ()}, "strategies must be different ones, got none"),
+        ({"strategies": ("direct", "direct")}, "strategies must be different ones, got direct, direct"),
+        ({"variants": ("half",)}, "variants must be among full, .*, got 'half'"),
+        ({"variants": ()}, "variants must be different ones, got none"),
+        ({"variants": ("random:3", "random:3")}, "variants must be different ones"),
+        ({"variants": ("points",)}, "variants: points takes a number of points"),
+        ({"methods": ("guess",)}, "methods must be made of .*, got 'guess'"),
+        ({"methods": ()}, "methods must be different ones, got none"),
     ],
 )
 def test_bad_options_are_named(values, message):
     with pytest.raises(ValueError, match=message):
         BenchmarkOptions(**values)
+
+
+def test_a_variant_may_be_compared_in_several_settings():
+    options = BenchmarkOptions(variants=("random:3", "random:4", "dominating", "dominating:k=2"))
+    assert [one.kind for one in options.parsed_variants] == ["random", "random", "dominating", "dominating"]

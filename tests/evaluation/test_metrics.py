@@ -1,55 +1,101 @@
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pycolmap
 import pytest
+from handmade import random_pose, rigid
 
 from scenes import BOX
+from slimsfm.datasets.base import ObjectModel
 from slimsfm.evaluation.metrics import (
     NO_POSE,
     PoseError,
     add_percent,
-    confidence_wrong,
     deg_cm_percent,
+    errors_of_poses,
+    model_error,
     pose_error,
-    score,
+    within_deg_cm,
+    wrong_when_sure,
 )
-from slimsfm.localization import Localization, Seconds
-from slimsfm.pose import PoseEstimate
+from slimsfm.geometry import Box
 
 DIAGONAL = 2 * np.sqrt(1.0**2 + 0.8**2 + 0.6**2)
+PILLAR = np.array([[1, 2, 0], [-1, -2, 0], [2, -1, 3], [-2, 1, 3], [0, 0, 5], [0, 0, -5]], np.float64)
+"""Vertices that half a turn about z leaves as they are."""
 
 
-def rigid(axis=(0.0, 0.0, 1.0), angle_deg=0.0, translation=(0.0, 0.0, 0.0)):
-    half = np.radians(angle_deg) / 2
-    quaternion = [*(np.sin(half) * np.array(axis) / np.linalg.norm(axis)), np.cos(half)]
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(quaternion)), np.array(translation, np.float64))
+def model_of(vertices, *, symmetric=False, diameter=10.0):
+    return ObjectModel(vertices=np.array(vertices, np.float64), diameter=diameter, symmetric=symmetric)
 
 
-def error(corner=0.0, deg=0.0, translation=0.0):
-    return PoseError(relative_corner_error=corner, rotation_deg=deg, translation=translation)
+# The published formulas, as they are usually written down.
 
 
-def localization(pose=None, extract=0.01, match=0.02, pose_seconds=0.005, confidence=None):
-    inliers = np.ones(20, dtype=bool)
-    return Localization(
-        pose=pose and PoseEstimate(cam_from_world=pose, inliers=inliers, confidence=confidence),
-        camera=pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480),
-        points2D=np.zeros((20, 2)),
-        points3D_in_world=np.zeros((20, 3)),
-        references=3,
-        seconds=Seconds(extract=extract, match=match, pose=pose_seconds),
-    )
+def angle_by_trace(a, b):
+    """The arc cosine of the trace, cut off where rounding takes it beyond what has an arc cosine."""
+    trace = np.trace(a.rotation.matrix() @ b.rotation.matrix().T)
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def moved(pose, points):
+    return points @ pose.rotation.matrix().T + pose.translation
+
+
+def add_by_hand(estimated, true, points):
+    return np.mean(np.sqrt(np.sum((moved(estimated, points) - moved(true, points)) ** 2, axis=1)))
+
+
+def adds_by_hand(estimated, true, points):
+    """From each point under the true pose to each under the other, of which the least counts."""
+    offsets = moved(true, points)[:, None] - moved(estimated, points)[None]
+    return np.mean(np.min(np.sqrt(np.sum(offsets**2, axis=2)), axis=1))
+
+
+def test_errors_agree_with_the_published_formulas_on_a_thousand_poses():
+    rng = np.random.default_rng(0)
+    vertices = rng.uniform(-1, 1, (20, 3))
+    asymmetric, symmetric = (model_of(vertices, symmetric=one, diameter=2.5) for one in (False, True))
+    compared = 0
+    for number in range(1000):
+        true = random_pose(rng)
+        # every other estimate is a near one
+        estimated = random_pose(rng) if number % 2 else near(true, rng)
+        found = pose_error(estimated, true, BOX)
+        angle = angle_by_trace(estimated, true)
+        if 1 < angle < 179:
+            compared += 1
+            assert abs(found.rotation_deg - angle) < 1e-9
+        offset = estimated.translation - true.translation
+        assert_close(found.translation, np.sqrt(offset @ offset))
+        assert_close(found.relative, add_by_hand(estimated, true, BOX.corners) / DIAGONAL)
+        by_vertices = pose_error(estimated, true, BOX, asymmetric)
+        assert by_vertices == replace(found, relative=by_vertices.relative)
+        assert_close(by_vertices.relative, add_by_hand(estimated, true, vertices) / 2.5)
+        nearest = pose_error(estimated, true, BOX, symmetric).relative
+        assert_close(nearest, adds_by_hand(estimated, true, vertices) / 2.5)
+        assert nearest <= by_vertices.relative * (1 + 1e-12)
+    assert compared > 900
+
+
+def assert_close(found, expected):
+    assert abs(found - expected) <= 1e-10 * expected
+
+
+def near(pose, rng):
+    return rigid(rng.normal(size=3), rng.uniform(0, 10), rng.normal(scale=0.03, size=3)) * pose
 
 
 def test_equal_poses_have_no_error():
     pose = rigid((1, 2, 3), 77.0, (1, -2, 3))
-    assert pose_error(pose, pose, BOX) == error()
+    assert pose_error(pose, pose, BOX) == PoseError(relative=0.0, rotation_deg=0.0, translation=0.0)
+    assert pose_error(pose, pose, BOX, model_of(PILLAR, symmetric=True)).relative == 0.0
 
 
 def test_a_shift_moves_every_corner_by_its_length():
     found = pose_error(rigid(translation=(0.03, 0.04, 0.0)), rigid(), BOX)
-    assert found.relative_corner_error == pytest.approx(0.05 / DIAGONAL)
+    assert found.relative == pytest.approx(0.05 / DIAGONAL)
     assert found.translation == pytest.approx(0.05)
     assert found.rotation_deg == 0.0
 
@@ -59,50 +105,106 @@ def test_a_turn_about_z_moves_every_corner_along_its_chord(angle_deg):
     """All corners are equally far from the axis; a chord is twice that radius times the half angle's sine."""
     found = pose_error(rigid(angle_deg=angle_deg), rigid(), BOX)
     chord = 2 * np.hypot(1.0, 0.8) * np.sin(np.radians(angle_deg) / 2)
-    assert found.relative_corner_error == pytest.approx(chord / DIAGONAL, rel=1e-6)
+    assert found.relative == pytest.approx(chord / DIAGONAL, rel=1e-6)
     assert found.rotation_deg == pytest.approx(angle_deg, rel=1e-6)
     assert found.translation == 0.0
 
 
-def random_pose(rng):
-    quaternion = rng.normal(size=4)
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), rng.normal(size=3))
+@pytest.mark.parametrize("angle", [1e-8, 1e-7, np.pi - 1e-7, np.pi - 1e-8], ids=str)
+def test_angles_near_0_and_180_degrees_are_known_to_a_billionth_of_a_radian(angle):
+    """There the cosine hardly changes, so the formula by the trace loses half of the digits."""
+    rng = np.random.default_rng(1)
+    ours, by_trace = [], []
+    for _ in range(50):
+        true = random_pose(rng)
+        estimated = rigid(rng.normal(size=3), np.degrees(angle)) * true
+        ours.append(np.radians(pose_error(estimated, true, BOX).rotation_deg))
+        by_trace.append(np.radians(angle_by_trace(estimated, true)))
+    assert np.abs(np.array(ours) - angle).max() < 1e-9
+    assert np.abs(np.array(by_trace) - angle).max() > 1e-9
 
 
-def test_errors_agree_with_the_published_formulas_on_a_thousand_poses():
-    """The arc cosine of the trace, the distance of the translations, the mean over the corners."""
-    rng = np.random.default_rng(0)
-    compared = 0
-    for _ in range(1000):
-        a, b = random_pose(rng), random_pose(rng)
-        found = pose_error(a, b, BOX)
-        R, t = a.rotation.matrix(), a.translation
-        S, s = b.rotation.matrix(), b.translation
-        angle = np.degrees(np.arccos(np.clip((np.trace(R.T @ S) - 1) / 2, -1, 1)))
-        if 1 < angle < 179:
-            compared += 1
-            assert found.rotation_deg == pytest.approx(angle, abs=1e-9)
-        assert found.translation == pytest.approx(np.sqrt(np.sum((t - s) ** 2)))
-        distances = [np.linalg.norm((R @ corner + t) - (S @ corner + s)) for corner in BOX.corners]
-        assert found.relative_corner_error == pytest.approx(np.mean(distances) / DIAGONAL)
-        assert pose_error(b, a, BOX).relative_corner_error == pytest.approx(found.relative_corner_error)
-    assert compared > 950
+def test_a_matrix_whose_trace_is_over_three_is_no_turn_at_all():
+    """Rounding makes such matrices, of which the arc cosine knows nothing unless it is cut off."""
+    rounded = np.eye(3) * (1 + 1e-12)
+    assert np.trace(rounded) > 3
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(np.arccos((np.trace(rounded) - 1) / 2))
+    estimated = pycolmap.Rigid3d(pycolmap.Rotation3d(rounded), np.zeros(3))
+    assert pose_error(estimated, rigid(), BOX).rotation_deg == 0.0
 
 
-def test_no_pose_is_infinitely_wrong_and_counts_as_failure():
-    assert pose_error(None, rigid(), BOX) is NO_POSE
-    errors = [NO_POSE, error(), error(), NO_POSE]
-    assert add_percent(errors, 0.1) == 50.0
-    assert deg_cm_percent(errors, 5) == 50.0
+def test_a_pose_and_its_opposite_quaternion_are_the_same():
+    pose = rigid((1, 2, 3), 20.0)
+    opposite = pycolmap.Rigid3d(pycolmap.Rotation3d(-pose.rotation.quat), pose.translation)
+    assert pose_error(opposite, pose, BOX).rotation_deg == 0.0
 
 
-def test_add_counts_what_is_below_the_fraction():
-    errors = [error(corner) for corner in (0.0, 0.0199, 0.02, 0.05, 0.0999, 0.1, 3.0, np.inf)]
+def test_half_a_turn_of_a_symmetric_object_is_no_error_but_for_one_that_is_not_symmetric():
+    half_a_turn = rigid(angle_deg=180.0)
+    assert model_error(half_a_turn, rigid(), model_of(PILLAR, symmetric=True)) == pytest.approx(0, abs=1e-15)
+    assert model_error(half_a_turn, rigid(), model_of(PILLAR)) == pytest.approx(
+        4 * 2 * np.sqrt(5) / 6 / 10  # four of six vertices change places with those across
+    )
+
+
+def test_a_quarter_of_a_turn_is_an_error_of_an_object_that_half_a_turn_leaves_as_it_is():
+    assert model_error(rigid(angle_deg=90.0), rigid(), model_of(PILLAR, symmetric=True)) > 0.01
+
+
+def test_the_nearest_vertex_is_sought_of_each_vertex_where_it_truly_is():
+    """True at 0, 1 and 10, thought to be at 9, 10 and 19: 9, 8 and 0; the other way it were 1, 0 and 9."""
+    line = model_of([[0, 0, 0], [1, 0, 0], [10, 0, 0]], symmetric=True)
+    assert model_error(rigid(translation=(9, 0, 0)), rigid(), line) == pytest.approx(17 / 3 / 10)
+
+
+def test_the_diagonal_is_the_largest_distance_of_two_corners_of_any_box():
+    """Turned, sheared or flat: without right angles diagonals differ, and the longest counts."""
+    rng = np.random.default_rng(2)
+    edges = [rng.normal(size=(3, 3)) for _ in range(50)]
+    edges += [np.diag([1.0, 0.0, 0.0]), np.diag([3.0, 2.0, 1.0]) @ random_pose(rng).rotation.matrix()]
+    edges += [np.array([[1.0, 0, 0], [0.9, 0.3, 0], [0, 0, 1.0]])]
+    for half_edges in edges:
+        box = Box(rng.normal(size=3), half_edges)
+        longest = max(np.linalg.norm(a - b) for a, b in combinations(box.corners, 2))
+        assert box.diagonal == pytest.approx(longest)
+        shift = rigid(translation=(0, 0, longest / 10))
+        assert pose_error(shift, rigid(), box).relative == pytest.approx(0.1)
+
+
+def test_errors_are_relative_to_the_diameter_that_comes_with_the_model():
+    shift = rigid(translation=(0, 0, 1.0))
+    for diameter in (5.0, 20.0):
+        model = model_of(PILLAR, diameter=diameter)
+        assert model_error(shift, rigid(), model) == pytest.approx(1 / diameter)
+
+
+@pytest.mark.parametrize("model", [None, model_of(PILLAR), model_of(PILLAR, symmetric=True)])
+def test_no_pose_is_infinitely_wrong_and_counts_as_failure(model):
+    assert pose_error(None, rigid(), BOX, model) is NO_POSE
+    errors = errors_of_poses([None, rigid(), rigid(), None], [rigid()] * 4, BOX, model)
+    relative, degrees, metres = (
+        np.array([getattr(one, name) for one in errors])
+        for name in ("relative", "rotation_deg", "translation")
+    )
+    for fraction in (0.1, 1.0, 1e9):
+        assert add_percent(relative, fraction) == 50.0
+    assert deg_cm_percent(degrees, metres, 5) == 50.0
+    assert within_deg_cm(degrees, metres, 180).tolist() == [False, True, True, False]
+
+
+def test_every_pose_has_its_truth():
+    with pytest.raises(ValueError, match="zip"):
+        errors_of_poses([rigid(), rigid()], [rigid()], BOX)
+
+
+def test_add_counts_what_is_below_the_fraction_and_not_what_is_equal():
+    errors = np.array([0.0, 0.0199, 0.02, 0.05, 0.0999, 0.1, 3.0, np.inf])
     assert [add_percent(errors, fraction) for fraction in (0.02, 0.05, 0.1)] == [25.0, 37.5, 62.5]
 
 
 @pytest.mark.parametrize(
-    ("deg", "translation", "expected"),
+    ("deg", "metres", "expected"),
     [
         (1.0, 0.01, 100.0),
         (1.0001, 0.01, 0.0),
@@ -112,60 +214,27 @@ def test_add_counts_what_is_below_the_fraction():
         (3.0, 0.002, 0.0),
     ],
 )
-def test_degrees_and_centimetres_must_both_be_within(deg, translation, expected):
-    assert deg_cm_percent([error(deg=deg, translation=translation)], 1) == expected
+def test_degrees_and_centimetres_must_both_be_within(deg, metres, expected):
+    assert deg_cm_percent(np.array([deg]), np.array([metres]), 1) == expected
 
 
 @pytest.mark.parametrize("n", [1, 3, 5])
-def test_the_boundary_of_n_degrees_n_centimetres_is_within(n):
-    assert deg_cm_percent([error(deg=float(n), translation=n / 100)], n) == 100.0
-    assert deg_cm_percent([error(deg=float(n), translation=n / 100 + 1e-6)], n) == 0.0
-
-
-def test_scores_sum_up_mixed_outcomes():
-    errors = [error(0.01, 0.5, 0.004), error(0.03, 2.0, 0.02), error(0.2, 20.0, 0.1), NO_POSE, NO_POSE]
-    found = [localization(rigid())] * 3 + [localization(), localization(extract=0.06, match=0.12)]
-    scores = score(errors, found, metric=True)
-    assert scores.queries == 5
-    assert scores.localized == 60.0
-    assert scores.add == {0.1: 40.0, 0.05: 40.0, 0.02: 20.0}
-    assert scores.deg_cm == {1: 20.0, 3: 40.0, 5: 40.0}
-    assert scores.median_corner_error == 0.2
-    assert scores.seconds.extract == pytest.approx(0.02)
-    assert scores.seconds.match == pytest.approx(0.04)
-    assert scores.seconds.pose == pytest.approx(0.005)
-    assert scores.fps == pytest.approx(1 / 0.065)
-
-
-def test_without_a_metric_unit_there_are_no_centimetres():
-    assert score([error()], [localization(rigid())], metric=False).deg_cm is None
-
-
-def test_the_median_is_infinite_unless_more_than_half_are_localized():
-    found = [localization()] * 4
-    assert np.isinf(
-        score([error(0.01), error(0.01), NO_POSE, NO_POSE], found, metric=False).median_corner_error
-    )
-    most = score([error(0.01), error(0.02), error(0.04), NO_POSE], found, metric=False)
-    assert most.median_corner_error == pytest.approx(0.03)
-
-
-def test_no_query_has_no_score():
-    with pytest.raises(ValueError, match="at least one query"):
-        score([], [], metric=True)
-
-
-def test_results_cannot_be_changed():
-    with pytest.raises(AttributeError):
-        NO_POSE.rotation_deg = 0.0
-    assert replace(NO_POSE, rotation_deg=0.0).rotation_deg == 0.0
+def test_translations_are_metres_and_the_boundary_of_n_degrees_n_centimetres_is_within(n):
+    degrees = np.array([float(n)])
+    assert deg_cm_percent(degrees, np.array([n / 100]), n) == 100.0
+    assert deg_cm_percent(degrees, np.array([n / 100 + 1e-6]), n) == 0.0
+    assert deg_cm_percent(degrees + 1e-9, np.array([n / 100]), n) == 0.0
 
 
 def test_only_sure_poses_count_as_wrong_when_sure():
-    pose = rigid((0, 0, 1), 10.0, (0, 0, 2))
-    found = [localization(pose, confidence=one) for one in (0.95, 0.99, 0.9, 0.2)] + [localization()]
-    errors = [error(0.01), error(0.1), error(0.5), error(0.5), NO_POSE]
-    assert confidence_wrong(errors, found) == 0.5
-    assert confidence_wrong(errors[2:], found[2:]) is None
-    assert score(errors, found, metric=False).confidence_wrong == 0.5
-    assert score(errors, found, metric=False).references_tried == 3
+    """Over 0.9 is sure; a tenth of the diagonal is wrong; no confidence is not sure."""
+    errors = np.array([0.01, 0.1, 0.5, 0.5, np.inf])
+    confidence = np.array([0.95, 0.99, 0.9, 0.2, np.nan])
+    assert wrong_when_sure(errors, confidence, 0.1) == 0.5
+    assert wrong_when_sure(errors[2:], confidence[2:], 0.1) is None
+
+
+def test_errors_cannot_be_changed():
+    with pytest.raises(AttributeError):
+        NO_POSE.rotation_deg = 0.0
+    assert replace(NO_POSE, rotation_deg=0.0).rotation_deg == 0.0

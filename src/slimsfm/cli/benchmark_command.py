@@ -1,118 +1,111 @@
 """`slimsfm benchmark`."""
 
-import tempfile
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from inspect import Signature, signature, unwrap
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import tyro
+
+from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import Flat, ImagesPath, OutputPath, Stopwatch, console, finish, parse, print_rows
-from slimsfm.cli.results import maps_in, print_comparison, write_results
-from slimsfm.datasets.images import hold_out, query_names
+from slimsfm.cli.output import Flat, OutputPath, Stopwatch, console, finish, parse
+from slimsfm.cli.results import print_comparisons, print_run, write_results
+from slimsfm.datasets import DATASETS
+from slimsfm.datasets.base import Dataset
 from slimsfm.errors import InputError
-from slimsfm.evaluation.benchmark import BenchmarkOptions, benchmark
-from slimsfm.evaluation.protocol import held_out_queries, prepare
-from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import graph_of
-from slimsfm.graph.source import Edges
-from slimsfm.mapping.build import BuildOptions, build_map
-from slimsfm.mapping.io import read_map, weigh_map, write_map
-from slimsfm.mapping.map import Map
-from slimsfm.photos import list_images
+from slimsfm.evaluation.benchmark import Bench, BenchmarkOptions
+from slimsfm.evaluation.comparison import compare_runs
+from slimsfm.evaluation.result_files import digest_of, read_run
+from slimsfm.evaluation.run import run_benchmark
+from slimsfm.mapping.build import BuildOptions
 from slimsfm.progress import shown
 
+_USAGE = """usage: slimsfm benchmark DATASET PATH -o RUN   (more: slimsfm benchmark DATASET --help)
+       slimsfm benchmark --compare RUN RUN
 
-def benchmark_images(
-    images: ImagesPath,
-    /,
+Data sets: {datasets}."""
+
+
+def benchmark(
+    dataset: Dataset,
     output: OutputPath,
-    extractor: str | None = None,
-    query_every: int = 3,
-    edges: Edges = "localize",
     comparison: Annotated[BenchmarkOptions, Flat] = BenchmarkOptions(),
     build: BuildOptions = BuildOptions(),
     networks: Annotated[Networks, Flat] = Networks(),
-    keep_maps: Path | None = None,
+    execution: Annotated[Execution, Flat] = Execution(workers=1),
+    overwrite: bool = False,
 ) -> None:
-    """Measure full against slim maps on any folder of photos.
+    """Measure methods and slim maps on a data set: accuracy, speed and size, with what chance there is in it.
 
-    All photos are reconstructed together, which gives pseudo ground truth; every n-th is held out as a query.
+    What is done is kept object by object: the same command goes on where it was cut off.
 
     Args:
-        images: Folder of photos.
-        output: Folder for results.json and the pseudo-ground-truth model, which is reused where it exists.
-        extractor: Local features of references and queries, see `slimsfm methods`.
-        query_every: Every n-th image in order of name, from the first, is a query; the rest are references.
-        edges: How the reference graph is computed; the paper localizes each image from each other one.
+        dataset: The data set.
+        output: Folder of the run: results.json, table.md, .tex and .csv, queries.csv, and the maps.
         comparison: What is compared.
-        build: How the pseudo ground truth is reconstructed.
+        build: How photos are mapped; its extractor and matcher are those of the methods.
         networks: Where learned methods run.
-        keep_maps: Keep the maps that are compared in this folder.
+        execution: Where objects are measured. Times are comparable only with one worker, the default.
+        overwrite: Start anew where the output holds a run of other options.
     """
     watch = Stopwatch()
     networks.apply()
-    matcher = None if comparison.matcher == "auto" else comparison.matcher
-    build = replace(build, extractor=extractor or build.extractor, matcher=matcher or build.matcher)
-    query_names(list_images(images), query_every)  # refused before the long work, not after
-    truth = _ground_truth(images, output / "pseudo-ground-truth", build)
-    names = query_names(list(truth.images), query_every)
-    references = hold_out(truth, names)
-    options = GraphOptions(edges=edges, candidates="all", matcher=comparison.matcher)
-    graph = graph_of(references, output, options, progress=shown).graph
-    queries = held_out_queries(truth, images, names)
-    prepared = prepare(references, queries, shown)
-    with tempfile.TemporaryDirectory(prefix="slimsfm-benchmark-") as temporary:
-        result = benchmark(
-            references,
-            graph,
-            prepared,
-            name=images.name,
-            store=maps_in(keep_maps or Path(temporary)),
-            weigh=weigh_map,
-            options=comparison,
-            progress=shown,
-        )
-    print_rows(result.rows)
-    print_comparison(result.rows)
-    write_results(output / "results.json", {images.name: (graph, result)}, comparison)
-    finish(
-        f"{output / 'results.json'}: {len(names)} queries",
-        watch,
-        "reduce",
-        output / "pseudo-ground-truth",
-        "-o SMALL",
-    )
+    if (build.extractor, build.matcher) != (BuildOptions().extractor, BuildOptions().matcher):
+        raise InputError("build.extractor and build.matcher: name them as --methods EXTRACTOR+MATCHER")
+    bench = Bench(folder=output, options=comparison, build=build, progress=shown)
+    with resumable():
+        run = run_benchmark(dataset, bench, execution.open_executor(), shown, overwrite=overwrite)
+    if run.objects:
+        write_results(run)
+        print_run(run)
+    for name, why in run.failed.items():
+        console.print(f"{name}: could not be measured: {why}", style="red")
+    if run.failed:
+        name, why = next(iter(run.failed.items()))
+        count = f"{len(run.failed)} of {len(run.failed) + len(run.objects)}"
+        raise InputError(f"{name}: {why} ({count} objects could not be measured; mend and run it again)")
+    queries = sum(len(one.queries) for one in run.objects)
+    what = f"{output}: {len(run.objects)} objects, {queries} queries, digest {digest_of(run.objects)}"
+    finish(what, watch, "report", output, "-o", "report.html")
 
 
-def _ground_truth(images: Path, path: Path, build: BuildOptions) -> Map:
-    names = list_images(images)
-    if not path.exists():
-        with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
-            made = build_map(images, Path(workspace), build, progress=shown)
-            write_map(made.map, path)
-    truth = read_map(path)
-    left_out = sorted(set(names) - truth.images.keys())
-    if strangers := truth.images.keys() - set(names):
-        raise InputError(
-            f"{path}: is of other images ({min(strangers)} is not in {images}); choose another output folder"
-        )
-    if left_out:
-        console.print(f"not in the model and so left out: {', '.join(left_out)}", style="yellow")
-    return truth
+def compare(before: Path, after: Path) -> None:
+    """Show how two runs differ on what they have in common, and how probable that is by chance."""
+    old, new = read_run(before), read_run(after)
+    print_comparisons(compare_runs(old, new))
+    machines = {key: (old.environment.get(key), new.environment.get(key)) for key in ("cpu", "cores", "gpu")}
+    for key, (one, other) in machines.items():
+        if one != other:
+            console.print(f"times are not comparable: {key} {one} and {other}", style="yellow")
 
 
 def main(arguments: Sequence[str]) -> None:
     """Run the command."""
     kind, *rest = arguments or ["--help"]
     if kind in ("-h", "--help"):
-        console.print(
-            "usage: slimsfm benchmark images DIR -o RESULTS   (more: slimsfm benchmark images --help)"
-        )
-        return
-    if kind not in _KINDS:
-        raise InputError(f"{kind!r} is no kind of data set; there is {', '.join(_KINDS)}")
-    parse(_KINDS[kind], rest)
+        console.print(_USAGE.format(datasets=", ".join(DATASETS)))
+    elif kind == "--compare":
+        if len(rest) != 2:
+            raise InputError(f"--compare takes two runs, got {len(rest)}; see slimsfm benchmark --help")
+        compare(*(Path(one) for one in rest))
+    elif kind not in DATASETS:
+        raise InputError(f"{kind!r} is no kind of data set; there are {', '.join(DATASETS)}")
+    else:
+        parse(_command(DATASETS[kind]), rest, kind)
 
 
-_KINDS = {"images": benchmark_images}
+def _command(dataset: type) -> Callable[..., None]:
+    """The command for one kind of data set: what that cannot do without stands first, and has no flag."""
+
+    def command(*args: Any, **kwargs: Any) -> None:
+        benchmark(*args, **kwargs)
+
+    options = Annotated[dataset, Flat, tyro.conf.PositionalRequiredArgs]
+    taken = signature(benchmark).parameters.values()
+    parameters = [one.replace(annotation=options) if one.name == "dataset" else one for one in taken]
+    plain = unwrap(command)  # a type checker may have wrapped it
+    plain.__doc__ = benchmark.__doc__
+    plain.__annotations__ = {**benchmark.__annotations__, "dataset": options}
+    plain.__dict__["__signature__"] = Signature(parameters)
+    return plain

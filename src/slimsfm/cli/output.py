@@ -12,11 +12,8 @@ from typing import Annotated, Any, TypeVar
 import pycolmap
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from slimsfm.errors import InputError, OutputError
-from slimsfm.evaluation.metrics import DEG_CM
-from slimsfm.evaluation.table import Row
 from slimsfm.files import check_writable
 from slimsfm.mapping.map import Map
 
@@ -37,13 +34,18 @@ _WIDTH = 170  # of the widest table; narrower terminals wrap lines themselves, w
 console = Console(highlight=False, soft_wrap=True, width=_WIDTH)
 
 
-def parse(command: Callable[..., Result], arguments: Sequence[str]) -> Result:
+def parse(command: Callable[..., Result], arguments: Sequence[str], kind: str = "") -> Result:
     """Call a command with what the arguments say; its signature is the command line.
+
+    Args:
+        command: Lies in the module of its name.
+        arguments: What stands after the command's name, and its kind.
+        kind: Which of the kinds that the command has.
 
     Raises:
         InputError: An argument is missing, unknown or of a value that its options refuse.
     """
-    name = command.__module__.rpartition(".")[2].removesuffix("_command")
+    name = f"{command.__module__.rpartition('.')[2].removesuffix('_command')} {kind}".strip()
 
     @wraps(command)
     def bound(*args: Any, **kwargs: Any) -> Callable[[], Result]:
@@ -115,52 +117,6 @@ def size(num_bytes: float | int) -> str:
             return f"{num_bytes:.3g} {unit}" if num_bytes < 100 else f"{num_bytes:.0f} {unit}"
         num_bytes /= 1000
     return f"{num_bytes:.3g} GB"
-
-
-def print_rows(rows: Sequence[Row]) -> None:
-    """Print the paper's table; the degree-centimetre columns only where the unit is metric."""
-    metric = all(row.scores.deg_cm is not None for row in rows)
-    several = len({row.object for row in rows}) > 1
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for column in _header(metric=metric, several=several):
-        table.add_column(
-            column, justify="right" if column not in ("object", "strategy", "variant") else "left"
-        )
-    for row in rows:
-        table.add_row(*_cells(row, metric=metric, several=several))
-    console.print(table)
-    console.print(
-        "0.1d, 0.05d, 0.02d: % of queries with box corners off by less than this share of the diagonal d; "
-        "median: of that error; found: % with any pose; "
-        "wrong: % beyond 0.1d of the poses with confidence over 0.9; tried: references matched with a query",
-        style="dim",
-    )
-    if not metric:
-        console.print("n°-n cm: not given, for the unit of the map is unknown", style="dim")
-
-
-def _header(*, metric: bool, several: bool) -> list[str]:
-    return [
-        *(["object"] if several else []),
-        *("strategy", "variant", "images", "points", "size"),
-        *([f"{n}°-{n}cm" for n in DEG_CM] if metric else []),
-        *("0.1d", "0.05d", "0.02d", "median", "found", "wrong", "tried", "extract", "match", "pose", "FPS"),
-    ]
-
-
-def _cells(row: Row, *, metric: bool, several: bool) -> list[str]:
-    scores, seconds = row.scores, row.scores.seconds
-    return [
-        *([row.object] if several else []),
-        *(row.strategy, row.variant, f"{row.references:.0f}", f"{row.points:.0f}", size(row.map_bytes)),
-        *([f"{share:.1f}" for share in (scores.deg_cm or {}).values()] if metric else []),
-        *(f"{share:.1f}" for share in scores.add.values()),
-        *(f"{scores.median_corner_error:.4f}d", f"{scores.localized:.1f}"),
-        "-" if scores.confidence_wrong is None else f"{100 * scores.confidence_wrong:.1f}",
-        f"{scores.references_tried:.1f}",
-        *(f"{1e3 * part:.1f} ms" for part in (seconds.extract, seconds.match, seconds.pose)),
-        f"{scores.fps:.1f}",
-    ]
 
 
 def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:

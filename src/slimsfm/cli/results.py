@@ -1,85 +1,90 @@
-"""What the commands that measure share: storing maps, comparing rows, writing results."""
+"""What the commands that measure share: showing a run and writing its results."""
 
-import json
-import os
-import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Sequence
+
+from rich.table import Table
 
 from slimsfm.cli.output import console
-from slimsfm.evaluation.benchmark import Benchmark, BenchmarkOptions, Store, StoredMap
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.columns import brief_columns
+from slimsfm.evaluation.comparison import Comparison, against_full
+from slimsfm.evaluation.formats import (
+    all_rows,
+    csv_queries,
+    csv_table,
+    is_metric,
+    labels,
+    latex_table,
+    markdown_page,
+    p_value,
+    shown,
+)
+from slimsfm.evaluation.result_files import run_to_json, write_json
+from slimsfm.evaluation.results import Run
+from slimsfm.evaluation.summary import summarize_domination
+from slimsfm.evaluation.table import BY_FRAME, Row
 from slimsfm.files import replacing
-from slimsfm.graph import ReferenceGraph
-from slimsfm.mapping.io import bytes_by_part, read_map, write_map
-from slimsfm.mapping.map import Map
 
 
-def maps_in(folder: Path) -> Store:
-    """A store that keeps maps in a folder."""
-
-    def store(map: Map, name: str) -> StoredMap:
-        path = folder / name
-        write_map(map, path, overwrite=True)
-        return read_map(path), bytes_by_part(path)["total"]
-
-    return store
-
-
-def print_comparison(rows: Sequence[Row]) -> None:
-    """Say, for each object and strategy, what a slim map gains and what it costs.
-
-    Points chosen for direct matching stand against the full map matched exhaustively, where that was done.
-    """
-    full = {(row.object, row.strategy): row for row in rows if row.variant == "full"}
-    for slim in (row for row in rows if row.variant != "full"):
-        strategies = ("exhaustive", slim.strategy) if slim.variant == "default" else (slim.strategy,)
-        against = next((full[slim.object, one] for one in strategies if (slim.object, one) in full), None)
-        if against:
-            smaller = against.map_bytes / slim.map_bytes
-            console.print(
-                f"{slim.object}, {slim.strategy}: {slim.variant} is {speedup(against, slim):.1f}x faster in "
-                f"matching and pose than full, {against.strategy}, and {smaller:.0f}x smaller; "
-                f"ADD-0.1d {against.scores.add[0.1]:.1f} -> {slim.scores.add[0.1]:.1f}"
-            )
-
-
-def speedup(full: Row, slim: Row) -> float:
-    """How many times faster matching and pose are."""
-    a, b = full.scores.seconds, slim.scores.seconds
-    return (a.match + a.pose) / (b.match + b.pose)
-
-
-def write_results(
-    path: Path, objects: Mapping[str, tuple[ReferenceGraph, Benchmark]], options: BenchmarkOptions
-) -> None:
-    """Write rows, dominating sets, options and environment as JSON, replacing earlier results."""
-    threshold = options.reduction.threshold
-    data = {
-        "rows": [row.to_json() for _, result in objects.values() for row in result.rows],
-        "objects": {
-            name: {
-                "references": len(graph.names),
-                "edges": graph.num_edges(threshold),
-                "dominating_set": [graph.names[i] for i in result.solution.chosen],
-                "lower_bound": result.solution.lower_bound,
-            }
-            for name, (graph, result) in objects.items()
-        },
-        "options": asdict(options),
-        "environment": _environment(),
+def write_results(run: Run) -> None:
+    """Write a run into its folder: results.json, and its table as Markdown, LaTeX and CSV."""
+    rows, comparisons = all_rows(run), against_full(run.objects)
+    data = run_to_json(run) | {
+        "rows": [row.to_json() for row in rows],
+        "comparisons": [one.to_json() for one in comparisons],
+        "dominating_sets": [one.to_json() for one in summarize_domination(run.objects)],
     }
-    with replacing(path, overwrite=True) as partial:
-        partial.write_text(json.dumps(data, indent=2) + "\n")
-
-
-def _environment() -> dict[str, str]:
-    packages = ("slimsfm", "numpy", "scipy", "pycolmap", "poselib", "opencv-python-headless")
-    return {
-        **{package: version(package) for package in packages},
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "cpus": str(len(os.sched_getaffinity(0))),
+    texts = {
+        "table.md": markdown_page(run, rows, comparisons),
+        "table.tex": latex_table(rows, run.dataset),
+        "table.csv": csv_table(rows),
+        "queries.csv": csv_queries(run.objects),
     }
+    for name, text in texts.items():
+        with replacing(run.folder / name, overwrite=True) as partial:
+            partial.write_text(text, encoding="utf-8")
+    write_json(run.folder / "results.json", data)
+
+
+def print_run(run: Run) -> None:
+    """Print the table, what slim maps gain and lose, and the sizes of dominating sets."""
+    print_rows(all_rows(run))
+    compared = against_full(run.objects)
+    overall = [one for one in compared if one.object == BY_FRAME]
+    print_comparisons(overall or compared)
+    for one in summarize_domination(run.objects):
+        console.print(
+            f"{one.method}: dominating sets of {one.smallest} to {one.largest} images, {one.mean:.2f} "
+            f"on average; images kept {one.images_kept_mean:.3f} (median {one.images_kept_median:.3f}), "
+            f"points kept {one.points_kept_mean:.3f} (median {one.points_kept_median:.3f})"
+        )
+
+
+def print_rows(rows: Sequence[Row]) -> None:
+    """Print the table; the degree-centimetre columns only where the unit is metric."""
+    metric = is_metric(rows)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for title in ("object", "method", "strategy", "map"):
+        table.add_column(title, no_wrap=True)
+    for column in brief_columns(metric=metric):
+        table.add_column(column.title.removesuffix(" ms"), justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*labels(row), *(shown(row, one) for one in brief_columns(metric=metric)))
+    console.print(table)
+    console.print(
+        "ADD-0.1d: % of queries with box corners off by less than a tenth of the diagonal d; "
+        "extract, match, pose: ms a query; intervals and more are in table.md and table.csv",
+        style="dim",
+    )
+    if not metric:
+        console.print("n°-n cm: not given, for the unit of the map is unknown", style="dim")
+
+
+def print_comparisons(comparisons: Sequence[Comparison]) -> None:
+    """Say, line by line, what one map gains and what it costs against another."""
+    for one in comparisons:
+        console.print(
+            f"{one.object}, {', '.join(one.after)}: {one.faster:.1f}x faster in matching and pose "
+            f"({one.faster_between.low:.1f} to {one.faster_between.high:.1f}) than {', '.join(one.before)}, "
+            f"{one.smaller:.0f}x smaller; ADD-0.1d {one.add_before:.1f} -> {one.add_after:.1f} "
+            f"({one.add_gain.low:+.1f} to {one.add_gain.high:+.1f}, p {p_value(one.p_value)})"
+        )

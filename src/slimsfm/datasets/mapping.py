@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pycolmap
 
-from slimsfm.datasets.onepose import ObjectSequences
-from slimsfm.mapping.build import Build, BuildOptions, KnownPoses, build_map
+from slimsfm.datasets.base import ObjectSequences, PosedSequence
+from slimsfm.datasets.images import hold_out
+from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
+from slimsfm.mapping.map import Map
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -14,16 +16,30 @@ def map_object(
     workspace: Path,
     options: BuildOptions = BuildOptions(),
     progress: ProgressBar = silent,
-) -> Build:
-    """Triangulate a map from an object's mapping sequence and its known poses, in the object's frame."""
-    mapping = sequences.mapping
-    camera = pycolmap.Camera(mapping.camera.todict())
-    camera.camera_id = 1
-    names = [path.name for path in mapping.image_paths]
+) -> Map:
+    """Map an object by its mapping sequence, in its own frame.
+
+    Points are triangulated from the known poses; where these come from a map with the features that are
+    wanted, that map without the queries is taken.
+    """
+    truth = sequences.truth
+    if truth is not None and truth.info.extractor == options.extractor:
+        return hold_out(truth, list(sequences.query.names))
     known = KnownPoses(
-        cameras=dict.fromkeys(names, camera),
-        cam_from_world=dict(zip(names, mapping.cam_from_world, strict=True)),
+        cameras=_numbered_cameras(sequences.mapping),
+        cam_from_world=dict(zip(sequences.mapping.names, sequences.mapping.cam_from_world, strict=True)),
         box=sequences.box,
-        unit="metre",
+        unit=sequences.unit,
     )
-    return build_map(mapping.image_paths[0].parent, workspace, options, known, progress)
+    return build_map(sequences.mapping.folder, workspace, options, known, progress).map
+
+
+def _numbered_cameras(sequence: PosedSequence) -> dict[str, pycolmap.Camera]:
+    """The camera of each image; equal ones have one number."""
+    numbers: dict[tuple, int] = {}
+    cameras = {}
+    for name, camera in zip(sequence.names, sequence.cameras, strict=True):
+        key = (camera.model_name, camera.width, camera.height, camera.params.tobytes())
+        number = numbers.setdefault(key, len(numbers) + 1)
+        cameras[name] = pycolmap.Camera(camera.todict() | {"camera_id": number})
+    return cameras

@@ -9,6 +9,9 @@ from pathlib import Path
 from PIL import Image as PilImage
 
 from slimsfm.datasets import onepose
+from slimsfm.datasets.base import Making, ObjectSequences
+from slimsfm.datasets.reading import check_known
+from slimsfm.errors import InputError
 from slimsfm.files import check_writable, replacing
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.synthetic.objects import OBJECTS
@@ -52,6 +55,65 @@ class SynthesisOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Synthetic:
+    """Rendered objects: those that are not there yet are rendered first."""
+
+    path: Path
+    """Folder of the objects' folders."""
+
+    objects: tuple[str, ...] = tuple(OBJECTS)
+    """Names of objects; all by default."""
+
+    mapping_frames: int | None = None
+    """Frames of the video that maps an object. Here and below: else as many as are there, or as `slimsfm
+    synthesize` renders by default."""
+
+    query_frames: int | None = None
+    """Frames of the video that asks for poses."""
+
+    width: int | None = None
+    """Of an image, in pixels."""
+
+    height: int | None = None
+    """Of an image, in pixels."""
+
+    render_seed: int = 0
+    """Of what is rendered, as of `slimsfm synthesize`; objects that are there already may be of any."""
+
+    def __post_init__(self) -> None:
+        self._options(self.objects)
+
+    def names(self) -> tuple[str, ...]:
+        """The objects, sorted."""
+        return tuple(sorted(self.objects))
+
+    def load(self, name: str, making: Making) -> ObjectSequences:
+        """Read one object, rendered before where it is not there; one that is must be what is asked for."""
+        check_known(name, self.names(), self.path)
+        if not (self.path / name).exists():
+            synthesize(self.path, self._options((name,)), progress=making.progress)
+        made = onepose.read_object(self.path / name)
+        found = {
+            "mapping_frames": len(made.mapping.names),
+            "query_frames": len(made.query.names),
+            "width": made.mapping.cameras[0].width,
+            "height": made.mapping.cameras[0].height,
+        }
+        for field, value in found.items():
+            if getattr(self, field) not in (None, value):
+                raise InputError(
+                    f"{self.path / name} was rendered with {field} {value}, not {getattr(self, field)}: "
+                    "ask for what is there, or choose another folder"
+                )
+        return made
+
+    def _options(self, objects: tuple[str, ...]) -> SynthesisOptions:
+        fields = ("mapping_frames", "query_frames", "width", "height")
+        asked = {field: getattr(self, field) for field in fields if getattr(self, field) is not None}
+        return SynthesisOptions(objects=objects, seed=self.render_seed, **asked)
+
+
+@dataclass(frozen=True, kw_only=True)
 class _TakeKey:
     """All that a take depends on: little enough to send to another process."""
 
@@ -70,7 +132,7 @@ def synthesize(
     overwrite: bool = False,
     progress: ProgressBar = silent,
     executor: Executor | None = None,
-) -> list[onepose.ObjectSequences]:
+) -> list[ObjectSequences]:
     """Render objects and write each as one of OnePose's: `NAME/NAME-1` maps it, `NAME/NAME-2` queries it.
 
     Args:

@@ -1,4 +1,4 @@
-"""Localize queries of known pose against a map and variants of it."""
+"""Localize queries of known pose against a map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,9 +7,8 @@ from time import perf_counter
 
 import pycolmap
 
-from slimsfm.datasets.onepose import PosedSequence
-from slimsfm.evaluation.metrics import PoseError, pose_error, score
-from slimsfm.evaluation.table import Row
+from slimsfm.datasets.base import ObjectModel, PosedSequence
+from slimsfm.evaluation.outcomes import Outcomes, outcomes_of
 from slimsfm.features import Features, load_extractor
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
@@ -49,20 +48,10 @@ class PreparedQuery:
 def queries_of(sequence: PosedSequence) -> list[Query]:
     """The frames of a sequence as queries."""
     return [
-        Query(path=path, camera=sequence.camera, cam_from_world=pose)
-        for path, pose in zip(sequence.image_paths, sequence.cam_from_world, strict=True)
-    ]
-
-
-def held_out_queries(truth: Map, images: Path, names: Sequence[str]) -> list[Query]:
-    """Images of a map, in a folder, as queries whose poses in the map are taken for true."""
-    return [
-        Query(
-            path=images / name,
-            camera=truth.camera(name),
-            cam_from_world=truth.images[name].cam_from_world(),
+        Query(path=path, camera=camera, cam_from_world=pose)
+        for path, camera, pose in zip(
+            sequence.image_paths, sequence.cameras, sequence.cam_from_world, strict=True
         )
-        for name in names
     ]
 
 
@@ -77,23 +66,6 @@ def prepare(map: Map, queries: Sequence[Query], progress: ProgressBar = silent) 
         seconds = perf_counter() - start
         prepared.append(PreparedQuery(query=query, features=features, extract_seconds=seconds))
     return prepared
-
-
-@dataclass(frozen=True, kw_only=True)
-class Label:
-    """What a row of a table is about."""
-
-    object: str
-    """Name of the object or scene."""
-
-    strategy: str
-    """How queries are matched."""
-
-    matcher: str = "auto"
-    """What matches a query and a reference image."""
-
-    variant: str
-    """Name of the variant that the map is."""
 
 
 def localize_all(
@@ -116,57 +88,29 @@ def localize_all(
     return [_localize(localizer, query) for query in progress(queries, f"localize queries ({strategy})")]
 
 
-def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
-    image = read_image(prepared.query.path) if localizer.looks_at_images else None
-    found = localizer.localize_features(prepared.features, prepared.query.camera, image=image)
-    return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))
-
-
-def errors_of(map: Map, queries: Sequence[PreparedQuery], found: Sequence[Localization]) -> list[PoseError]:
-    """Compare what was found with the truth."""
-    return [
-        pose_error(one.pose and one.pose.cam_from_world, prepared.query.cam_from_world, map.box)
-        for prepared, one in zip(queries, found, strict=True)
-    ]
-
-
 def evaluate(
     map: Map,
     queries: Sequence[PreparedQuery],
-    label: Label,
-    *,
-    map_bytes: int,
+    strategy: str,
+    matcher: str = "auto",
     progress: ProgressBar = silent,
-) -> Row:
-    """Localize queries against one map and sum up.
+    model: ObjectModel | None = None,
+) -> Outcomes:
+    """Localize queries against a map and compare with the truth.
 
     Args:
         map: The map.
         queries: The queries.
-        label: What it is about.
-        map_bytes: Size of the map on disk.
+        strategy: How they are matched.
+        matcher: What matches images.
         progress: Told of each query.
+        model: The object's model, where the data set has one.
     """
-    found = localize_all(map, queries, label.strategy, label.matcher, progress)
-    return row_of(map, queries, found, label, map_bytes=map_bytes)
+    found = localize_all(map, queries, strategy, matcher, progress)
+    return outcomes_of(found, [one.query.cam_from_world for one in queries], map.box, model)
 
 
-def row_of(
-    map: Map,
-    queries: Sequence[PreparedQuery],
-    found: Sequence[Localization],
-    label: Label,
-    *,
-    map_bytes: int,
-) -> Row:
-    """Sum up what localizing queries against one map gave; arguments as of `evaluate`."""
-    errors = errors_of(map, queries, found)
-    return Row(
-        object=label.object,
-        strategy=label.strategy,
-        variant=label.variant,
-        references=len(map.images),
-        points=len(map.point3D_ids),
-        map_bytes=map_bytes,
-        scores=score(errors, found, metric=map.info.unit == "metre"),
-    )
+def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
+    image = read_image(prepared.query.path) if localizer.looks_at_images else None
+    found = localizer.localize_features(prepared.features, prepared.query.camera, image=image)
+    return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))

@@ -1,12 +1,23 @@
-"""The paper's table: one row a strategy and variant of the map."""
+"""The paper's table: one row a method, strategy and variant of the map, of each object and over all."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
-from slimsfm.evaluation.metrics import ADD_FRACTIONS, DEG_CM, SURE, Scores
-from slimsfm.localization import Seconds
+from slimsfm.evaluation.metrics import DEG_CM, SURE
+from slimsfm.evaluation.outcomes import join
+from slimsfm.evaluation.results import Cell, ObjectResult
+from slimsfm.evaluation.scores import Scores, mean_scores, score, shares
+from slimsfm.evaluation.statistics import Interval, bootstrap
+from slimsfm.geometry import ADD_FRACTIONS
+
+BY_FRAME = "all, by frame"
+"""The object of rows in which every query counts alike, as in the paper."""
+
+BY_OBJECT = "all, by object"
+"""The object of rows in which every object counts alike."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,31 +25,38 @@ class Row:
     """How one strategy does on one variant of a map."""
 
     object: str
-    """Name of the object or scene."""
+    """Name of the object or scene, or that of an average."""
+
+    method: str
+    """The method: an extractor, or extractor+matcher."""
 
     strategy: str
     """How queries were matched."""
 
     variant: str
-    """Which map: "full", "dominating" or "random"."""
+    """Which map."""
 
-    references: float | int
-    """Reference images of the map; a mean where the variant is one of several draws."""
+    references: float
+    """Reference images of the map; a mean where there are several maps."""
 
-    points: float | int
+    points: float
     """Points of the map, likewise."""
 
-    map_bytes: float | int
+    map_bytes: float
     """Size of the map on disk, likewise."""
 
     scores: Scores
     """What localizing the queries gave, likewise."""
+
+    intervals: dict[str, Interval]
+    """95 % intervals of the percentages and of the queries a second, by name in `to_json`."""
 
     def to_json(self) -> dict:
         """The row as plain values, under the names of `results.json`; what has no value is None."""
         scores, seconds = self.scores, self.scores.seconds
         values = {
             "object": self.object,
+            "method": self.method,
             "strategy": self.strategy,
             "variant": self.variant,
             "references": self.references,
@@ -47,7 +65,7 @@ class Row:
             "queries": scores.queries,
             "localized": scores.localized,
             **{f"add_{fraction}d": scores.add[fraction] for fraction in ADD_FRACTIONS},
-            "median_corner_error": _finite(scores.median_corner_error),
+            "median_error": scores.median_error if np.isfinite(scores.median_error) else None,
             f"confidence_wrong_at_{SURE}": scores.confidence_wrong,
             "references_tried": scores.references_tried,
             "ms_extract": 1e3 * seconds.extract,
@@ -58,46 +76,77 @@ class Row:
         }
         if scores.deg_cm is not None:
             values |= {f"{n}deg_{n}cm": scores.deg_cm[n] for n in DEG_CM}
+        for key, interval in self.intervals.items():
+            values |= {f"{key}_low": interval.low, f"{key}_high": interval.high}
         return values
 
 
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def rows_of(result: ObjectResult) -> list[Row]:
+    """The rows of an object."""
+    return [_row(result.name, [cell], metric=result.unit == "metre") for cell in result.cells]
 
 
-def mean_row(rows: Sequence[Row]) -> Row:
-    """The mean of several draws of one variant; the medians' median stands for the median."""
-    first, scores = rows[0], [row.scores for row in rows]
-    seconds = [one.seconds for one in scores]
-    metric = all(one.deg_cm is not None for one in scores)
+def average_rows(results: Sequence[ObjectResult]) -> list[Row]:
+    """The averages over several objects, by frame and by object, each over those that have the line."""
+    if len(results) < 2:
+        return []
+    keys = dict.fromkeys(cell.key for result in results for cell in result.cells)
+    metric = all(result.unit == "metre" for result in results)
+    cells = {key: [cell for one in results if (cell := one.cell(*key))] for key in keys}
+    return [
+        _row(name, some, metric=metric, by_object=name == BY_OBJECT)
+        for name in (BY_FRAME, BY_OBJECT)
+        for some in cells.values()
+    ]
+
+
+def _row(name: str, cells: Sequence[Cell], *, metric: bool, by_object: bool = True) -> Row:
+    """One row of the cells that objects have of one key."""
+    each = [score(cell.outcomes, metric=metric, trials=len(cell.trials)) for cell in cells]
+    sizes = np.array([one.queries for one in each])
+    weights = np.ones(len(cells)) / len(cells) if by_object else sizes / sizes.sum()
+    maps = np.array(
+        [
+            np.mean([(trial.references, trial.points, trial.map_bytes) for trial in cell.trials], axis=0)
+            for cell in cells
+        ]
+    )
+    references, points, map_bytes = maps.mean(axis=0).tolist()
     return Row(
-        object=first.object,
-        strategy=first.strategy,
-        variant=first.variant,
-        references=_mean([row.references for row in rows]),
-        points=_mean([row.points for row in rows]),
-        map_bytes=_mean([row.map_bytes for row in rows]),
-        scores=Scores(
-            queries=first.scores.queries,
-            localized=_mean([one.localized for one in scores]),
-            add={fraction: _mean([one.add[fraction] for one in scores]) for fraction in ADD_FRACTIONS},
-            median_corner_error=float(np.median([one.median_corner_error for one in scores])),
-            deg_cm={n: _mean([(one.deg_cm or {})[n] for one in scores]) for n in DEG_CM} if metric else None,
-            confidence_wrong=_mean_of_known([one.confidence_wrong for one in scores]),
-            references_tried=_mean([one.references_tried for one in scores]),
-            seconds=Seconds(
-                extract=_mean([one.extract for one in seconds]),
-                match=_mean([one.match for one in seconds]),
-                pose=_mean([one.pose for one in seconds]),
-            ),
-        ),
+        object=name,
+        method=cells[0].method,
+        strategy=cells[0].strategy,
+        variant=cells[0].variant,
+        references=references,
+        points=points,
+        map_bytes=map_bytes,
+        scores=mean_scores(each) if by_object else _pooled(cells, metric=metric),
+        intervals=_intervals(cells, weights, metric=metric),
     )
 
 
-def _mean(values: Sequence[float | int]) -> float:
-    return float(np.mean(values))
+def _pooled(cells: Sequence[Cell], *, metric: bool) -> Scores:
+    """All queries of all objects in one heap."""
+    outcomes = join([cell.outcomes for cell in cells])
+    return score(outcomes, metric=metric, trials=len(cells[0].trials))
 
 
-def _mean_of_known(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return _mean(known) if known else None
+def per_query(cell: Cell, values: np.ndarray) -> Float64[np.ndarray, " queries"]:
+    """The mean over the trials of a cell of values of its outcomes."""
+    return values.reshape(len(cell.trials), -1).mean(axis=0).astype(np.float64)
+
+
+def _intervals(cells: Sequence[Cell], weights: np.ndarray, *, metric: bool) -> dict[str, Interval]:
+    criteria = shares(metric=metric)
+
+    def values(cell: Cell) -> Float64[np.ndarray, "queries k"]:
+        found = [100 * per_query(cell, fulfil(cell.outcomes)) for fulfil in criteria.values()]
+        return np.column_stack([*found, per_query(cell, cell.outcomes.seconds.sum(axis=1))])
+
+    def figures(means: Float64[np.ndarray, "resamples groups k"]) -> Float64[np.ndarray, "resamples k"]:
+        found = np.einsum("rgk,g->rk", means, weights)
+        found[:, -1] = 1 / found[:, -1]
+        return found
+
+    intervals = bootstrap([values(cell) for cell in cells], figures)
+    return dict(zip([*criteria, "fps"], intervals, strict=True))

@@ -1,0 +1,210 @@
+"""The table as text: Markdown, LaTeX and CSV."""
+
+import csv
+import io
+from collections.abc import Sequence
+from itertools import groupby
+
+from slimsfm.evaluation.columns import STAGES, Column, paper_columns
+from slimsfm.evaluation.comparison import Comparison
+from slimsfm.evaluation.results import ObjectResult, Run
+from slimsfm.evaluation.summary import DominationSummary, summarize_domination
+from slimsfm.evaluation.table import Row, average_rows, rows_of
+
+_LABELS = ("Object", "Method", "Strategy", "Map")
+_NOTHING = "\N{EN DASH}"
+_TIMES = "\N{MULTIPLICATION SIGN}"
+
+
+def is_metric(rows: Sequence[Row]) -> bool:
+    """Whether some row is in centimetres."""
+    return any(row.scores.deg_cm is not None for row in rows)
+
+
+def labels(row: Row) -> tuple[str, str, str, str]:
+    """What a row is about."""
+    return row.object, row.method, row.strategy, row.variant
+
+
+def shown(row: Row, column: Column, *, interval: bool = False) -> str:
+    """A value as it is written, with its 95 % interval if wanted; a dash where there is none."""
+    values = row.to_json()
+    value = values.get(column.key)
+    if value is None:
+        return _NOTHING
+    low, high = values.get(f"{column.key}_low"), values.get(f"{column.key}_high")
+    if not interval or low is None or high is None:
+        return column.show(value)
+    return f"{column.show(value)} [{column.show(low)}, {column.show(high)}]"
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """The paper's columns with 95 % intervals of ADD-0.1d, and the times of the stages."""
+    shown_columns = (*paper_columns(metric=is_metric(rows)), *STAGES)
+    header = [*_LABELS, *(column.title for column in shown_columns)]
+    rule = [*("---" for _ in _LABELS), *("---:" for _ in shown_columns)]
+    lines = [
+        [*labels(row), *(shown(row, column, interval=column.key == "add_0.1d") for column in shown_columns)]
+        for row in rows
+    ]
+    return _markdown(header, rule, *lines)
+
+
+def markdown_comparisons(comparisons: Sequence[Comparison]) -> str:
+    """What lines gain and lose against others."""
+    header = [
+        "Object",
+        "Line",
+        "against",
+        "ADD-0.1d",
+        "95 % interval of the difference",
+        "p",
+        "faster",
+        "smaller",
+    ]
+    rule = ["---"] * 3 + ["---:"] * 5
+    lines = [
+        [
+            one.object,
+            ", ".join(one.after),
+            ", ".join(one.before),
+            f"{one.add_before:.1f} → {one.add_after:.1f}",
+            f"{one.add_gain.low:+.1f} to {one.add_gain.high:+.1f}",
+            p_value(one.p_value),
+            f"{one.faster:.1f}{_TIMES} ({one.faster_between.low:.1f} to {one.faster_between.high:.1f})",
+            f"{one.smaller:.1f}{_TIMES}",
+        ]
+        for one in comparisons
+    ]
+    return _markdown(header, rule, *lines)
+
+
+def _markdown(*lines: Sequence[str]) -> str:
+    cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+    return "".join(f"| {' | '.join(line)} |\n" for line in cells)
+
+
+def p_value(value: float) -> str:
+    """A probability as it is written."""
+    return f"{value:.3f}" if value >= 0.001 else "< 0.001"
+
+
+def markdown_summaries(summaries: Sequence[DominationSummary]) -> str:
+    """Sizes of dominating sets."""
+    kept = "Images kept, mean | median | Points kept, mean | median"
+    header = f"| Method | Objects | Images, min | mean | max | {kept} |\n|---|{'---:|' * 8}\n"
+    lines = [
+        f"| {one.method} | {one.objects} | {one.smallest} | {one.mean:.2f} | {one.largest} "
+        f"| {one.images_kept_mean:.3f} | {one.images_kept_median:.3f} "
+        f"| {one.points_kept_mean:.3f} | {one.points_kept_median:.3f} |\n"
+        for one in summaries
+    ]
+    return header + "".join(lines)
+
+
+def latex_table(rows: Sequence[Row], caption: str) -> str:
+    """The paper's table for LaTeX's package booktabs; a rule parts objects, methods and strategies."""
+    shown_columns = paper_columns(metric=is_metric(rows))
+    header = " & ".join(["Method", *(_latex(column.title) for column in shown_columns)])
+    groups = [list(group) for _, group in groupby(rows, key=lambda row: labels(row)[:3])]
+    lines = " \\\\\n    \\midrule\n".join(
+        " \\\\\n".join("    " + _latex_line(row, shown_columns) for row in group) for group in groups
+    )
+    return f"""\\begin{{table*}}
+    \\caption{{{_latex(caption)}}}
+    \\centering
+    \\begin{{tabular}}{{l{"r" * len(shown_columns)}}}
+    \\toprule
+    {header} \\\\
+    \\midrule
+{lines} \\\\
+    \\bottomrule
+    \\end{{tabular}}
+\\end{{table*}}
+"""
+
+
+def _latex_line(row: Row, shown_columns: Sequence[Column]) -> str:
+    name = f"{row.object}: {row.method}, {row.strategy}"
+    cells = [name if row.variant == "full" else f"{name} [{row.variant}]"]
+    cells += [shown(row, column) for column in shown_columns]
+    return " & ".join(_latex(cell) for cell in cells)
+
+
+def _latex(text: str) -> str:
+    return text.translate(_LATEX)
+
+
+_LATEX = str.maketrans(
+    {one: f"\\{one}" for one in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+    | {"\N{DEGREE SIGN}": r"$^\circ$", _NOTHING: "--"}
+)
+
+
+def csv_table(rows: Sequence[Row]) -> str:
+    """Every value of every row."""
+    values = [row.to_json() for row in rows]
+    return _csv(list(dict.fromkeys(key for one in values for key in one)), values)
+
+
+def csv_queries(results: Sequence[ObjectResult]) -> str:
+    """Every query of every line: what other statistics can be computed from."""
+    values = [
+        {
+            "object": result.name,
+            "method": cell.method,
+            "strategy": cell.strategy,
+            "variant": cell.variant,
+            "draw": draw,
+            "query": query.path.name,
+            "error": trial.outcomes.error[i],
+            "rotation_deg": trial.outcomes.rotation_deg[i],
+            "translation": trial.outcomes.translation[i],
+            "confidence": trial.outcomes.confidence[i],
+            "references_tried": trial.outcomes.references[i],
+            **dict(zip(("s_extract", "s_match", "s_pose"), trial.outcomes.seconds[i], strict=True)),
+        }
+        for result in results
+        for cell in result.cells
+        for draw, trial in enumerate(cell.trials)
+        for i, query in enumerate(result.queries)
+    ]
+    return _csv(list(values[0]) if values else [], values)
+
+
+def _csv(header: list[str], values: list[dict]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, header, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(values)
+    return text.getvalue()
+
+
+def markdown_page(run: Run, rows: Sequence[Row], comparisons: Sequence[Comparison]) -> str:
+    """All of a run on one page."""
+    made = "\n".join(f"- {key}: {value}" for key, value in run.environment.items())
+    failed = "".join(f"\n**{name} could not be measured**: {why}\n" for name, why in run.failed.items())
+    return f"""# {run.dataset}
+{failed}
+{markdown_table(rows)}
+Accuracy in % of queries, with 95 % bootstrap intervals over queries; d is the diagonal of the object's box.
+
+## Against the full map
+
+{markdown_comparisons(comparisons)}
+p: of such a difference between equally good maps, by sign flips of the queries' differences. Faster: matching
+and pose, without extraction.
+
+## Dominating sets
+
+{markdown_summaries(summarize_domination(run.objects))}
+## Environment
+
+{made}
+"""
+
+
+def all_rows(run: Run) -> list[Row]:
+    """Of every object, and the averages."""
+    return [*average_rows(run.objects), *(row for one in run.objects for row in rows_of(one))]

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from scenes import camera, exact_map
+from slimsfm.evaluation.protocol import (
+    PreparedQuery,
+    Query,
+    evaluate,
+    localize_all,
+    prepare,
+    queries_of,
+)
+from strategies import CLASSICAL
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    return exact_map(num_images=8, reach_deg=65.0)
+
+
+@pytest.fixture
+def queries(narrow, tmp_path):
+    """The references themselves, whose features are known and so need no file."""
+    return [
+        PreparedQuery(
+            query=Query(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
+            features=narrow.features[name],
+            extract_seconds=0.25,
+        )
+        for name, image in narrow.images.items()
+    ]
+
+
+@pytest.mark.parametrize("strategy", CLASSICAL)
+def test_outcomes_come_in_the_order_of_the_queries(narrow, queries, strategy):
+    outcomes = evaluate(narrow, queries, strategy)
+    assert len(outcomes) == 8
+    assert outcomes.error.max() < 1e-4
+    assert outcomes.seconds[:, 0].tolist() == [0.25] * 8
+
+
+@pytest.mark.parametrize("strategy", CLASSICAL)
+def test_no_query_is_refused(narrow, strategy):
+    with pytest.raises(ValueError, match="queries must hold at least one"):
+        localize_all(narrow, [], strategy)
+
+
+def test_queries_that_cannot_be_localized_stay_in_their_place(narrow, queries):
+    """Of a query that sees nothing of the map nothing is found, and the others do not mind."""
+    rng = np.random.default_rng(0)
+    lost = queries[3].features
+    strange = rng.normal(size=lost.descriptors.shape).astype(np.float32)
+    queries[3] = PreparedQuery(
+        query=queries[3].query,
+        features=type(lost)(
+            keypoints=lost.keypoints,
+            descriptors=strange / np.linalg.norm(strange, axis=1, keepdims=True),
+            scores=lost.scores,
+            image_size=lost.image_size,
+        ),
+        extract_seconds=0.25,
+    )
+    outcomes = evaluate(narrow, queries, "exhaustive")
+    assert np.flatnonzero(np.isinf(outcomes.error)).tolist() == [3]
+    assert [pose is None for pose in outcomes.cam_from_world].index(True) == 3
+
+
+def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
+    map_, queries = boulder.map, queries_of(boulder.mapping)[:3]
+    for query, prepared in zip(queries, prepare(map_, queries), strict=True):
+        stored = map_.features[query.path.name]
+        assert (prepared.features.keypoints == stored.keypoints).all()
+        assert (prepared.features.descriptors == stored.descriptors).all()
+        assert prepared.query is query
+        assert prepared.extract_seconds > 0
+
+
+def test_the_frames_of_a_sequence_are_queries(boulder):
+    queries = queries_of(boulder.query)
+    assert [one.path for one in queries] == list(boulder.query.image_paths)
+    assert [one.cam_from_world for one in queries] == list(boulder.query.cam_from_world)
+    assert all(one.camera.width == 320 for one in queries)

@@ -1,0 +1,34 @@
+from dataclasses import replace
+
+import pytest
+from handmade import FULL, cell_like, mapped_like, result_like
+
+from slimsfm.evaluation.summary import summarize_domination
+
+
+def test_dominating_sets_are_summed_up_by_method():
+    plain = result_like("toy", cell_like(FULL, [0.01]))
+    sizes = [(10, 2, 40), (20, 3, 50), (40, 10, 90)]
+    objects = [
+        replace(
+            plain,
+            maps=(
+                mapped_like("sift", references=references, chosen=chosen, dominating_points=points),
+                mapped_like("aliked"),
+            ),
+        )
+        for references, chosen, points in sizes
+    ]
+    sift, aliked = summarize_domination(objects)
+    assert (sift.method, sift.objects, sift.smallest, sift.largest) == ("sift", 3, 2, 10)
+    assert sift.mean == pytest.approx(5.0)
+    assert sift.images_kept_mean == pytest.approx((0.2 + 0.15 + 0.25) / 3)
+    assert sift.images_kept_median == pytest.approx(0.2)
+    assert sift.points_kept_mean == pytest.approx(0.6)
+    assert sift.points_kept_median == pytest.approx(0.5)
+    assert aliked.method == "aliked"
+    assert aliked.to_json()["points_kept_mean"] == pytest.approx(0.4)
+
+
+def test_without_objects_there_is_nothing_to_sum_up():
+    assert summarize_domination([]) == []
