@@ -1,14 +1,14 @@
 import numpy as np
 import pycolmap
 import pytest
+from runs import make_run
 
-from slimsfm.evaluation.metrics import Scores
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.results import Run
 from slimsfm.features import Features
 from slimsfm.geometry import Box
-from slimsfm.localization import Seconds
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.subset import keep_images
+from slimsfm.report import report_html
 
 BOX = Box(np.zeros(3), np.diag([0.5, 0.4, 0.3]))
 
@@ -60,19 +60,12 @@ def reduced(full):
 
 
 @pytest.fixture(scope="session")
-def make_row():
-    def make(variant, *, strategy="exhaustive", match=0.1, add=97.0, median=0.01, deg_cm=None, **sizes):
-        scores = Scores(
-            queries=25,
-            localized=100.0,
-            add={0.1: add, 0.05: 90.0, 0.02: 70.0},
-            median_corner_error=median,
-            deg_cm=deg_cm,
-            confidence_wrong=0.02,
-            references_tried=3.0,
-            seconds=Seconds(extract=0.03, match=match, pose=0.004),
-        )
-        sizes = {"references": 4.0, "points": 30.0, "map_bytes": 2.4e7, **sizes}
-        return Row(object="toy", strategy=strategy, variant=variant, scores=scores, **sizes)
+def run(tmp_path_factory) -> Run:
+    """A run over two objects, whose folder no test changes."""
+    return make_run(tmp_path_factory.mktemp("run"), {"can": 10, "mug": 11})
 
-    return make
+
+@pytest.fixture(scope="session")
+def html(run) -> str:
+    """The page of that run."""
+    return report_html(run)

@@ -1,18 +1,21 @@
 import re
+import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
+from itertools import pairwise
 
+import cv2
 import numpy as np
-import pycolmap
 import pytest
+from PIL import Image
 
-from slimsfm.errors import OutputError
-from slimsfm.report import ObjectReport, QueryFrame, write_report
-from slimsfm.report.page import report_html
+from slimsfm.errors import MapError, OutputError
+from slimsfm.report import report_html, write_report
+from slimsfm.report.budget import budget_for
+from slimsfm.report.jpegs import photo_uri
 
-TRUST = ["2.0", "3.0"]  # wrong when sure, references tried
-DASH = "\N{EN DASH}"
-ADD = ("97.0", "90.0", "70.0")
 VOID = {"meta", "img", "link", "br", "hr", "input"}
+BYTES_PER_POINT = 20  # three floats and three bytes, as text
 
 
 class Reader(HTMLParser):
@@ -20,15 +23,18 @@ class Reader(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.addresses, self.tags = [], [], []
-        self.rows, self.heads, self.in_cell = [], [], False
+        self.open, self.addresses, self.tags, self.ids = [], [], [], []
+        self.rows, self.text = [], ""
         self.feed(text)
         self.close()
         assert not self.open
 
-    def handle_starttag(self, tag, attributes):
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        self.addresses += [value for name, value in attributes if name in ("src", "href", "srcset", "data")]
+        self.addresses += [
+            value for name, value in attrs if name in ("src", "href", "xlink:href", "srcset", "data")
+        ]
+        self.ids += [value for name, value in attrs if name == "id"]
         if tag not in VOID:
             self.open.append(tag)
         if tag == "tr":
@@ -40,110 +46,153 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if {"td", "th"} & set(self.open):
+        if not {"script", "style"} & set(self.open):
+            self.text += data
+        if {"td", "th"} & set(self.open) and "small" not in self.open:
             self.rows[-1][-1] += data
 
 
 @pytest.fixture(scope="module")
-def report(full, reduced, camera, make_row):
-    rng = np.random.default_rng(1)
-    pose = full.images["1.jpg"].cam_from_world()
-    frames = tuple(
-        QueryFrame(
-            image=rng.integers(0, 255, (240, 320, 3), np.uint8),
-            camera=camera,
-            estimated_cam_from_world=None if k else pose,
-            true_cam_from_world=pose,
-            label=f"query/{k}.jpg",
-            relative_corner_error=None if k else 0.0,
-        )
-        for k in range(2)
-    )
-    rows = (
-        make_row("full", match=1.4),
-        make_row("dominating", match=0.1, references=1.0, map_bytes=1.1e6, median=np.inf),
-        make_row("random", strategy="direct", references=1.5, points=1234.0),
-    )
-    return ObjectReport(name="A <toy> & co", full=full, reduced=reduced, rows=rows, frames=frames)
+def page(html):
+    return Reader(html)
 
 
-def test_the_page_is_whole_html_with_every_part(report):
-    html = report_html([report, report], title="Two <objects>")
-    page = Reader(html)
-    assert page.tags.count("section") == page.tags.count("canvas") == page.tags.count("table") == 2
-    assert page.tags.count("img") == 4
-    assert "A &lt;toy&gt; &amp; co" in html
-    assert "<title>Two &lt;objects&gt;</title>" in html
-    assert html.count("query/1.jpg</b> not localized") == 2
+def test_the_page_is_whole_and_has_every_part_of_every_object(page):
+    assert page.tags.count("details") == page.tags.count("canvas") == 2
+    assert "Exact scenes" in page.text
+    for title in (
+        "Where it fails",
+        "Averages",
+        "Reference graph",
+        "Queries",
+        "Charts",
+        "How this was measured",
+    ):
+        assert title in page.text
+    assert len(set(page.ids)) == len(page.ids)
 
 
-def test_the_table_holds_every_row(report):
-    head, *rows = Reader(report_html([report], title="")).rows
-    assert head[:5] == ["Strategy", "Map", "Images", "Points", "Map size"]
-    times = ["30.0", "100.0", "4.0", "7.5"]
-    assert rows == [
-        ["exhaustive", "full", "4", "30", "24 MB", *ADD, "1.00 %", *TRUST, "30.0", "1400.0", "4.0", "0.7"],
-        ["exhaustive", "dominating", "1", "30", "1.1 MB", *ADD, DASH, *TRUST, *times],
-        ["direct", "random", "1.5", "1,234", "24 MB", *ADD, "1.00 %", *TRUST, *times],
+def test_only_the_first_object_is_open(html):
+    assert re.findall(r'<details class="card object" id="(object-\d)"( open)?>', html) == [
+        ("object-1", " open"),
+        ("object-2", ""),
     ]
 
 
-def test_degrees_and_centimetres_show_only_where_the_unit_is_known(full, reduced, make_row):
-    rows = (make_row("full", deg_cm={1: 11.0, 3: 33.0, 5: 55.0}), make_row("dominating"))
-    one = ObjectReport(name="", full=full, reduced=reduced, rows=rows, frames=())
-    head, metric, unknown = Reader(report_html([one], title="")).rows
-    assert head[5:8] == ["1°-1cm", "3°-3cm", "5°-5cm"]
-    assert metric[5:8] == ["11.0", "33.0", "55.0"]
-    assert unknown[5:8] == [DASH] * 3
+def test_the_top_says_what_was_gained_and_what_that_cost(page):
+    story = page.text[: page.text.index("Objects")]
+    assert re.search(r"2 objects, 7 queries: the default map, direct, is \S+ smaller, \S+ \S+;", story)
+    assert re.search(r"ADD-0.1d 100.0 % → 71.4 %", story)
+    assert "95 % interval" in story
+    assert "p 0.5" in story
 
 
-def test_the_page_fetches_nothing(report):
-    html = report_html([report], title="")
-    addresses = Reader(html).addresses
-    assert len(addresses) == 2
-    assert all(address.startswith("data:image/jpeg;base64,") for address in addresses)
-    assert not re.search(r"https?:|@import|url\(|\bfetch\(|XMLHttpRequest|WebSocket|\bimport\b", html)
+def test_tables_hold_every_line_of_every_object_and_average(page, run):
+    lines = sum(len(one.cells) for one in run.objects) + 2 * len(run.objects[0].cells)
+    known = {cell.key[1:] for one in run.objects for cell in one.cells}
+    found = [row for row in page.rows if known & set(pairwise(row))]
+    assert len(found) == lines
+    first = next(row for row in page.rows if row[:2] == ["exhaustive", "full"])
+    assert first[2:5] == ["7", "112", first[4]]
+    assert first[5:11] == ["100.0"] * 6
+
+
+def test_what_failed_stands_at_the_top_and_how_it_was_measured_at_the_bottom(page):
+    assert page.text.index("1 object could not be measured") < page.text.index("Size of the map")
+    assert "jug: there is no photo" in page.text
+    end = page.text[page.text.index("How this was measured") :]
+    assert "slimsfm benchmark exact -o run" in end
+    assert "a <fast> one" in end
+    assert "reduction.threshold0.05" in end
+
+
+def test_the_page_fetches_nothing(html, page):
+    inside = [address for address in page.addresses if address.startswith(("data:image/jpeg;base64,", "#"))]
+    assert inside == page.addresses
+    without_names = re.sub(r'xmlns(:xlink)?="[^"]+"', "", html)
+    assert not re.search(
+        r"https?:|@import|url\((?!#)|\bfetch\(|XMLHttpRequest|WebSocket|\bimport\b", without_names
+    )
     assert "default-src 'none'" in html
 
 
-def test_an_object_without_rows_and_frames_is_shown(full, reduced):
-    bare = ObjectReport(name="bare", full=full, reduced=reduced, rows=(), frames=())
-    page = Reader(report_html([bare], title=""))
-    assert "table" not in page.tags
-    assert "img" not in page.tags
-    assert "canvas" in page.tags
-
-
-def test_equal_input_gives_equal_bytes(report, tmp_path):
-    for name in ("a.html", "b.html"):
-        write_report(tmp_path / name, [report], title="same", overwrite=False)
-    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "b.html"]
-
-
-def test_what_is_there_stays_unless_overwriting(report, tmp_path):
-    path = tmp_path / "report.html"
-    path.write_text("mine")
-    with pytest.raises(OutputError, match="exists already"):
-        write_report(path, [report], title="new", overwrite=False)
-    assert path.read_text() == "mine"
-    write_report(path, [report], title="new", overwrite=True)
-    assert path.read_text(encoding="utf-8") == report_html([report], title="new")
-
-
-def test_a_page_of_nothing_is_refused_and_leaves_what_is_there(tmp_path):
+def test_a_run_without_objects_is_refused_and_leaves_what_is_there(run, tmp_path):
     path = tmp_path / "report.html"
     path.write_text("mine")
     with pytest.raises(ValueError, match="at least one object"):
-        write_report(path, [], title="", overwrite=True)
+        write_report(path, replace(run, objects=()), overwrite=True)
     assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("report.html", "mine")]
 
 
-def test_a_large_map_makes_no_large_page(full):
-    model = pycolmap.Reconstruction(full.model)
-    rng = np.random.default_rng(2)
-    for xyz in rng.uniform(-1, 1, (30_000, 3)):
-        model.add_point3D(xyz, pycolmap.Track(), np.zeros(3, np.uint8))
-    large = type(full)(model=model, features=full.features, info=full.info)
-    one = ObjectReport(name="large", full=large, reduced=large, rows=(), frames=())
-    assert len(report_html([one], title="").encode()) < 1_500_000
+@pytest.fixture
+def alone(run, tmp_path):
+    """A run of one object, which a test may damage."""
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mug"))
+    return replace(run, folder=folder, objects=run.objects[:1])
+
+
+def test_one_object_needs_no_averages_and_what_is_there_stays_unless_overwriting(alone, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("mine")
+    with pytest.raises(OutputError, match="exists already"):
+        write_report(path, alone, overwrite=False)
+    assert path.read_text() == "mine"
+    write_report(path, alone, overwrite=True)
+    text = Reader(path.read_text(encoding="utf-8")).text
+    assert "Averages" not in text
+    assert "1 object, 3 queries" in text
+
+
+def test_methods_are_named_where_there_are_several(alone):
+    can = alone.objects[0]
+    twice = replace(can, cells=(*can.cells, *(replace(cell, method="aliked") for cell in can.cells)))
+    text = Reader(report_html(replace(alone, objects=(twice,)))).text
+    assert "the sift: default map, direct" in text
+    assert "Maps and graph are those of sift." in text
+
+
+def test_photos_that_are_gone_are_told_of_once(alone, tmp_path):
+    can = alone.objects[0]
+    queries = tuple(replace(one, path=tmp_path / "gone" / one.path.name) for one in can.queries)
+    moved = replace(can, images=tmp_path / "gone", queries=queries)
+    html = report_html(replace(alone, objects=(moved,)))
+    assert "data:image" not in html
+    assert html.count("The photos are not in") == html.count("The query images are not in") == 1
+    assert "<canvas" in html
+
+
+def test_a_run_without_a_map_is_refused(alone):
+    shutil.rmtree(alone.map_path("can", "sift", "dominating"))
+    with pytest.raises(MapError, match="dominating"):
+        report_html(alone)
+
+
+def test_where_just_the_full_map_was_measured_nothing_is_compared(alone):
+    can = alone.objects[0]
+    full = replace(can, cells=tuple(cell for cell in can.cells if cell.variant == "full"))
+    text = Reader(report_html(replace(alone, objects=(full,)))).text
+    assert "just the full map was measured" in text
+    assert "Where it fails" not in text
+
+
+def test_six_objects_of_sixty_photos_fit_into_fifteen_megabytes(html, run, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    photo = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
+    Image.fromarray(photo).save(tmp_path / "photo.png")
+    limits = budget_for(6, 60)
+    sizes = [
+        len(photo_uri(tmp_path / "photo.png", side) or "") for side in (limits.photo_px, limits.frame_px)
+    ]
+    each = 2 * limits.points * BYTES_PER_POINT + 60 * sizes[0] + limits.frames * sizes[1]
+    assert limits.photo_px >= 64
+    assert 6 * (each + len(html) / len(run.objects)) < 15e6
+
+
+@pytest.mark.parametrize("references", [10, 60, 300, 3000])
+def test_the_more_there_is_the_less_is_shown_of_each(references):
+    few, many = budget_for(2, references), budget_for(100, references)
+    assert few.points > many.points
+    assert few.frames > many.frames
+    assert few.photo_px >= many.photo_px
+    assert references * (few.photo_px**2 * 0.75 * 0.5) <= 1e6

@@ -20,14 +20,14 @@ def poses_of(map):
     return [image.cam_from_world() for image in map.images.values()]
 
 
-def test_the_view_keeps_shape_and_puts_the_box_in_the_middle(full, reduced):
-    shown = scene(full, reduced)
+def test_the_view_keeps_shape_and_puts_the_box_in_the_middle(full):
+    shown = scene({"full": full}, ())
     corners = np.array(shown["box"])
     np.testing.assert_allclose(corners.mean(axis=0), 0, atol=1e-4)
     between = np.linalg.norm(corners[:, None] - corners[None], axis=2)
     expected = np.linalg.norm(full.box.corners[:, None] - full.box.corners[None], axis=2) / full.box.diagonal
     np.testing.assert_allclose(between, expected, atol=5e-4)
-    points = points_of(shown["before"])
+    points = points_of(shown["maps"]["full"])
     to_corners = np.linalg.norm(points[:, None] - corners[None], axis=2) * full.box.diagonal
     in_world = np.linalg.norm(full.points3D_in_world[:, None] - full.box.corners[None], axis=2)
     np.testing.assert_allclose(to_corners, in_world, atol=1e-3)
@@ -52,28 +52,29 @@ def test_opposite_cameras_still_give_a_view(full):
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
 
 
-def test_frusta_look_from_the_camera_at_what_it_sees(full, reduced):
-    shown = scene(full, reduced)
+def test_frustums_look_from_the_camera_at_what_it_sees(full):
+    shown = scene({"full": full}, ())
     frame = view_frame(poses_of(full), full.box)
-    for frustum, pose in zip(shown["before"]["images"], poses_of(full), strict=True):
+    for frustum, pose in zip(shown["images"], poses_of(full), strict=True):
         center, *corners = np.array(frustum)
         np.testing.assert_allclose(center, frame.apply(pose.inverse().translation[None])[0], atol=1e-4)
         axis = np.mean(corners, axis=0) - center  # these cameras look at the box's centre, here the origin
         assert axis @ -center == pytest.approx(np.linalg.norm(axis) * np.linalg.norm(center), rel=1e-3)
 
 
-def test_chosen_images_are_those_of_the_reduced_map(full, reduced):
-    shown = scene(full, reduced)
-    assert shown["before"]["chosen"] == [0, 1, 0, 0]
-    assert shown["after"]["chosen"] == [1]
-    assert shown["after"]["images"][0] == shown["before"]["images"][1]
-    np.testing.assert_array_equal(points_of(shown["after"]), points_of(shown["before"])[:20])
-    np.testing.assert_array_equal(colors_of(shown["before"]), full.colors)
+def test_each_map_shows_its_own_images_and_points(full, reduced):
+    shown = scene({"full": full, "dominating": reduced}, ["2.jpg"])
+    assert shown["chosen"] == [0, 1, 0, 0]
+    before, after = shown["maps"]["full"], shown["maps"]["dominating"]
+    assert before["images"] == [0, 1, 2, 3]
+    assert after["images"] == [1]
+    np.testing.assert_array_equal(points_of(after), points_of(before)[:20])
+    np.testing.assert_array_equal(colors_of(before), full.colors)
 
 
-def test_many_points_are_thinned_out_evenly(full, reduced):
-    everything = points_of(scene(full, reduced)["before"])
-    shown = scene(full, reduced, max_points=10)["before"]
+def test_many_points_are_thinned_out_evenly(full):
+    everything = points_of(scene({"full": full}, ())["maps"]["full"])
+    shown = scene({"full": full}, (), max_points=10)["maps"]["full"]
     rows = [int(np.flatnonzero((everything == point).all(axis=1))[0]) for point in points_of(shown)]
     assert len(colors_of(shown)) == len(rows) == 10
     assert rows[0] == 0
@@ -82,5 +83,5 @@ def test_many_points_are_thinned_out_evenly(full, reduced):
 
 
 def test_the_scene_is_plain_json(full, reduced):
-    shown = scene(full, reduced)
-    assert json.loads(json.dumps(shown, allow_nan=False))["before"] == shown["before"]
+    shown = scene({"full": full, "slim": reduced}, ())
+    assert json.loads(json.dumps(shown, allow_nan=False))["maps"] == shown["maps"]

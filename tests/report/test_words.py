@@ -1,48 +1,91 @@
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from slimsfm.report.words import headline, number, size
+from slimsfm.evaluation.comparison import Comparison
+from slimsfm.evaluation.results import MappedObject
+from slimsfm.evaluation.statistics import Interval
+from slimsfm.report.words import (
+    contents,
+    difference,
+    domination,
+    gain,
+    line_name,
+    percent_of_d,
+    plural,
+    ratio,
+)
+
+COMPARISON = Comparison(
+    object="can",
+    before=("sift", "exhaustive", "full"),
+    after=("sift", "direct", "default"),
+    queries=30,
+    add_before=98.0,
+    add_after=97.0,
+    add_gain=Interval(-2.5, 0.0),
+    p_value=0.4,
+    faster=14.2,
+    faster_between=Interval(13.0, 15.0),
+    smaller=860.3,
+)
+MAPPED = MappedObject(
+    method="sift",
+    references=60,
+    points=5000,
+    edges=900,
+    dominating_set=("1.png", "2.png"),
+    lower_bound=2,
+    dominating_points=1565,
+)
+TIMES = "\N{MULTIPLICATION SIGN}"
+
+
+def test_counts_take_their_plural():
+    assert [plural(1, "query"), plural(1234, "query"), plural(0, "image")] == [
+        "1 query",
+        "1,234 queries",
+        "0 images",
+    ]
+
+
+def test_contents_of_a_map(full, reduced):
+    assert contents(full) == "4 images, 30 points"
+    assert contents(reduced) == "1 image, 20 points"
 
 
 @pytest.mark.parametrize(
-    ("num_bytes", "text"),
+    ("value", "text"),
     [
-        (0, "0 B"),
-        (999, "999 B"),
-        (1000, "1.0 kB"),
-        (1_102_000, "1.1 MB"),
-        (24_000_000, "24 MB"),
-        (999_700, "1.0 MB"),
-        (3.2e12, "3200 GB"),
+        (14.2, f"14{TIMES} faster"),
+        (1.52, f"1.5{TIMES} faster"),
+        (0.5, f"2.0{TIMES} slower"),
+        (0.98, "equally fast"),
     ],
 )
-def test_sizes_are_said_in_fitting_units(num_bytes, text):
-    assert size(num_bytes) == text
+def test_ratios_say_which_way_they_go(value, text):
+    assert ratio(value, "faster", "slower") == text
 
 
-def test_counts_and_means_of_counts():
-    assert [number(8123), number(8123.0), number(2.5)] == ["8,123", "8,123", "2.5"]
+def test_a_gain_owns_up_to_its_cost():
+    assert gain(COMPARISON) == f"860{TIMES} smaller, 14{TIMES} faster; ADD-0.1d 98.0 % → 97.0 %"
+    assert "2.0" in gain(replace(COMPARISON, faster=0.5))
+    assert difference(COMPARISON) == "difference \N{MINUS SIGN}2.5 to +0.0 points, p 0.400"
 
 
-def test_the_headline_compares_equal_strategies(full, reduced, make_row):
-    rows = [
-        make_row("full", strategy="direct"),
-        make_row("full", match=1.396, add=98.0),
-        make_row("random", match=0.001),
-        make_row("dominating", match=0.096, map_bytes=1.1e6),
-    ]
-    assert headline(full, reduced, rows) == (
-        "4 images, 30 points, 24 MB → 1 image, 20 points, 1.1 MB; "
-        "ADD-0.1d 98.0 % → 97.0 %, matching and pose 14× faster."  # noqa: RUF001
+def test_lines_name_their_method_only_where_there_are_several():
+    assert line_name(COMPARISON.after, ["sift"]) == "default map, direct"
+    assert line_name(COMPARISON.after, ["sift", "aliked"]) == "sift: default map, direct"
+
+
+def test_a_dominating_set_is_told_with_what_is_proven():
+    assert domination(MAPPED) == (
+        "2 of 60 images dominate the others (no fewer can); they see 1,565 of 5,000 points."
     )
+    assert "(no fewer than 1 can)" in domination(replace(MAPPED, lower_bound=1))
 
 
-def test_the_headline_owns_up_to_a_loss(full, reduced, make_row):
-    slower = headline(full, reduced, [make_row("full", match=0.096), make_row("dominating", match=0.146)])
-    assert slower.endswith("matching and pose 1.5× slower.")  # noqa: RUF001
-    same = headline(full, reduced, [make_row("full"), make_row("dominating")])
-    assert same.endswith("matching and pose equally fast.")
-
-
-def test_without_a_row_of_each_map_the_headline_counts_alone(full, reduced, make_row):
-    for rows in ([], [make_row("full")], [make_row("full", strategy="direct"), make_row("dominating")]):
-        assert headline(full, reduced, rows) == "4 images, 30 points → 1 image, 20 points."
+def test_an_error_without_a_pose_is_no_number():
+    assert percent_of_d(np.inf) == "not localized"
+    assert percent_of_d(0.0213).replace("\N{NO-BREAK SPACE}", " ") == "2.1 % of d"

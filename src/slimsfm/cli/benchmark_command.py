@@ -1,6 +1,8 @@
 """`slimsfm benchmark`."""
 
+import shlex
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from inspect import Signature, signature, unwrap
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,6 +37,8 @@ def benchmark(
     networks: Annotated[Networks, Flat] = Networks(),
     execution: Annotated[Execution, Flat] = Execution(workers=1),
     overwrite: bool = False,
+    *,
+    command: str,
 ) -> None:
     """Measure methods and slim maps on a data set: accuracy, speed and size, with what chance there is in it.
 
@@ -48,6 +52,7 @@ def benchmark(
         networks: Where learned methods run.
         execution: Where objects are measured. Times are comparable only with one worker, the default.
         overwrite: Start anew where the output holds a run of other options.
+        command: What was typed; no option, but part of the result.
     """
     watch = Stopwatch()
     networks.apply()
@@ -56,6 +61,7 @@ def benchmark(
     bench = Bench(folder=output, options=comparison, build=build, progress=shown)
     with resumable():
         run = run_benchmark(dataset, bench, execution.open_executor(), shown, overwrite=overwrite)
+    run = replace(run, options={"command": command, **run.options})
     if run.objects:
         write_results(run)
         print_run(run)
@@ -92,20 +98,21 @@ def main(arguments: Sequence[str]) -> None:
     elif kind not in DATASETS:
         raise InputError(f"{kind!r} is no kind of data set; there are {', '.join(DATASETS)}")
     else:
-        parse(_command(DATASETS[kind]), rest, kind)
+        typed = shlex.join(["slimsfm", "benchmark", *arguments])
+        parse(_command(DATASETS[kind], typed), rest, kind)
 
 
-def _command(dataset: type) -> Callable[..., None]:
+def _command(dataset: type, typed: str) -> Callable[..., None]:
     """The command for one kind of data set: what that cannot do without stands first, and has no flag."""
 
     def command(*args: Any, **kwargs: Any) -> None:
-        benchmark(*args, **kwargs)
+        benchmark(*args, command=typed, **kwargs)
 
     options = Annotated[dataset, Flat, tyro.conf.PositionalRequiredArgs]
-    taken = signature(benchmark).parameters.values()
+    taken = [one for name, one in signature(benchmark).parameters.items() if name != "command"]
     parameters = [one.replace(annotation=options) if one.name == "dataset" else one for one in taken]
     plain = unwrap(command)  # a type checker may have wrapped it
     plain.__doc__ = benchmark.__doc__
-    plain.__annotations__ = {**benchmark.__annotations__, "dataset": options}
+    plain.__annotations__ = {one.name: one.annotation for one in parameters}
     plain.__dict__["__signature__"] = Signature(parameters)
     return plain

@@ -17,7 +17,8 @@ from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map
 from slimsfm.mapping.map import check_has_features
 from slimsfm.progress import shown
 from slimsfm.reduction import USES, FrontierOptions, frontier, recommend
-from slimsfm.report.curves import draw_curves
+from slimsfm.report.curves import curves_figure
+from slimsfm.report.figures import check_figure, save_figure
 
 
 def frontier_of(
@@ -37,7 +38,7 @@ def frontier_of(
         comparison: What is compared.
         edges: How the reference graph is computed, by which images are chosen.
         json: Write all figures here.
-        curves: Draw loss and time over size here, as SVG.
+        curves: Draw loss and time over size here, as .svg, .png or .pdf.
         execution: Where the reference graph is computed.
         overwrite: Replace what is there.
     """
@@ -45,6 +46,8 @@ def frontier_of(
     for path in (json, curves):
         if path:
             check_output(path, map, overwrite=overwrite)
+    if curves:
+        check_figure(curves)
     full, size = read_map(map), bytes_by_part(map)["total"]
     check_has_features(full)
     if len(full.images) < 2:
@@ -64,8 +67,7 @@ def frontier_of(
             data = frontier_to_json(found, recommended, full, size)
             partial.write_text(json_format.dumps(data, indent=2) + "\n")
     if curves:
-        with replacing(curves, overwrite=overwrite) as partial:
-            partial.write_text(draw_curves(found, recommended, size))
+        save_figure(curves_figure(found, recommended, size), curves, overwrite=overwrite)
     finish(f"{len(found.candidates)} ways to reduce {map}", watch, "reduce", map, "-o", f"{map}-small")
 
 

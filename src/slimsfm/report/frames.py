@@ -1,7 +1,5 @@
 """Query images with the object's box drawn in, estimated and true."""
 
-import base64
-import io
 from dataclasses import dataclass
 from html import escape
 
@@ -9,19 +7,16 @@ import cv2
 import numpy as np
 import pycolmap
 from jaxtyping import Float64
-from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
 from slimsfm.geometry import BOX_EDGES, Box, project
+from slimsfm.report.jpegs import jpeg_uri
 
 ESTIMATED_RGB = (235, 45, 40)
 """Colour of the box under the estimated pose."""
 
 TRUE_RGB = (30, 200, 70)
 """Colour of the box under the true pose."""
-
-MAX_SIDE_PX = 720
-"""Longer side of an image on the page; larger ones are scaled down."""
 
 _SAMPLES = 33  # points an edge is drawn through: distortion bends it
 _NEAR = 1e-3  # depth, over the box's diagonal, at which edges are cut
@@ -41,14 +36,14 @@ class QueryFrame:
     estimated_cam_from_world: pycolmap.Rigid3d | None
     """None where the query could not be localized."""
 
-    true_cam_from_world: pycolmap.Rigid3d | None
-    """None where it is unknown."""
+    true_cam_from_world: pycolmap.Rigid3d
+    """Where it truly stood."""
 
     label: str
     """Name of the frame."""
 
-    relative_corner_error: float | None
-    """Of the estimated pose, over the box's diagonal; None where the true pose is unknown."""
+    verdict: str
+    """What became of it."""
 
     def __post_init__(self) -> None:
         if (self.camera.width, self.camera.height) != self.image.shape[1::-1]:
@@ -58,26 +53,26 @@ class QueryFrame:
             )
 
 
-def frame_html(frame: QueryFrame, box: Box) -> str:
+def frame_html(frame: QueryFrame, box: Box, max_size: int) -> str:
     """The frame as a figure whose image is part of the page."""
     label = escape(frame.label)
+    uri = jpeg_uri(draw_frame(frame, box, max_size), thin_lines=True)
     return (
-        f'<figure><img src="{_jpeg_uri(draw_frame(frame, box))}" alt="{label} with the object\'s box">'
-        f"<figcaption><b>{label}</b> {_verdict(frame)}</figcaption></figure>"
+        f'<figure><img src="{uri}" alt="{label} with boxes">'
+        f"<figcaption><b>{label}</b> {escape(frame.verdict)}</figcaption></figure>"
     )
 
 
-def draw_frame(frame: QueryFrame, box: Box) -> Image:
-    """The image, at most `MAX_SIDE_PX` long, with the true box in green and the estimated in red."""
+def draw_frame(frame: QueryFrame, box: Box, max_size: int) -> Image:
+    """The image, at most so many pixels long, with the true box in green and the estimated in red."""
     height, width = frame.image.shape[:2]
-    scale = min(1.0, MAX_SIDE_PX / max(height, width))
+    scale = min(1.0, max_size / max(height, width))
     camera = pycolmap.Camera(frame.camera.todict())
     camera.rescale(max(1, round(width * scale)), max(1, round(height * scale)))
     size = (camera.width, camera.height)
     drawn = np.ascontiguousarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
     # the true box is the thicker, so that it shows where the two coincide
-    if frame.true_cam_from_world is not None:
-        draw_box(drawn, box, frame.true_cam_from_world, camera, TRUE_RGB, thickness=4)
+    draw_box(drawn, box, frame.true_cam_from_world, camera, TRUE_RGB, thickness=5)
     if frame.estimated_cam_from_world is not None:
         draw_box(drawn, box, frame.estimated_cam_from_world, camera, ESTIMATED_RGB, thickness=2)
     return drawn
@@ -136,17 +131,3 @@ def _draw_polyline(image: Image, points2D: Float64[np.ndarray, "n 2"], color: tu
     for k in np.flatnonzero(usable[:-1] & usable[1:]):
         ends = whole[k].tolist(), whole[k + 1].tolist()
         cv2.line(image, *ends, color, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _jpeg_uri(image: Image) -> str:
-    buffer = io.BytesIO()
-    PillowImage.fromarray(image).save(buffer, "JPEG", quality=85)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
-def _verdict(frame: QueryFrame) -> str:
-    if frame.estimated_cam_from_world is None:
-        return "not localized"
-    if frame.relative_corner_error is None:
-        return "true pose unknown"
-    return f"corners off by {100 * frame.relative_corner_error:.1f} % of the diagonal"

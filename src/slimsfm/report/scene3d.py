@@ -1,10 +1,11 @@
-"""The 3D view of a map before and after, as plain values that `viewer.js` draws.
+"""The 3D view of a map and its slim variants, as plain values that `viewer.js` draws.
 
 The view's frame has its origin at the centre of the object's box, the box's diagonal as unit, z where the
 images' upper edges point on average, and x towards the middle of the cameras.
 """
 
 import base64
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from slimsfm.arrays import Points3D
 from slimsfm.geometry import BOX_EDGES, Box
 from slimsfm.mapping.map import Map
 
-MAX_POINTS = 20_000
+MAX_POINTS = 15_000
 """Points shown of a map."""
 
 _FRUSTUM_LENGTH = 0.12  # over the median distance of the cameras from the box
@@ -36,22 +37,32 @@ class Frame:
         return (points3D_in_world - self.origin_in_world) @ self.view_from_world.T
 
 
-def scene(full: Map, reduced: Map, *, max_points: int = MAX_POINTS) -> dict:
-    """What the view shows: the points and images of both maps and the box, ready for JSON.
+def scene(maps: Mapping[str, Map], chosen: Collection[str], *, max_points: int = MAX_POINTS) -> dict:
+    """What the view shows: points and images of a map's variants and the box, ready for JSON.
 
-    Of more than `max_points` points of a map every so-manyth by id is shown. An image is marked as chosen if
-    the reduced map has it.
+    Of more than `max_points` points of a map every so-manyth by id is shown.
+
+    Args:
+        maps: By name; the first is the full map, the others have some of its images.
+        chosen: Images of the dominating set.
+        max_points: Points shown of a map.
     """
-    poses = [image.cam_from_world() for image in full.images.values()]
-    frame = view_frame(poses, full.box)
-    centers = frame.apply(np.array([pose.inverse().translation for pose in poses]))
-    length = _FRUSTUM_LENGTH * float(np.median(np.linalg.norm(centers, axis=1)))
-    before, after = (_shown(map_, frame, length, max_points) for map_ in (full, reduced))
+    full = next(iter(maps.values()))
+    frame = view_frame([image.cam_from_world() for image in full.images.values()], full.box)
+    length = _frustum_length(full, frame)
+    numbers = {name: number for number, name in enumerate(full.images)}
     return {
         "box": _rounded(frame.apply(full.box.corners)),
         "edges": BOX_EDGES,
-        "before": {**before, "chosen": [int(name in reduced.images) for name in full.images]},
-        "after": {**after, "chosen": [1] * len(reduced.images)},
+        "images": [_frustum(full, name, frame, length) for name in full.images],
+        "chosen": [int(name in chosen) for name in full.images],
+        "maps": {
+            name: {
+                **_points(shown, frame, max_points),
+                "images": [numbers[image] for image in shown.images],
+            }
+            for name, shown in maps.items()
+        },
     }
 
 
@@ -77,12 +88,18 @@ def _any_normal(z: np.ndarray) -> np.ndarray:
     return normal / np.linalg.norm(normal)
 
 
-def _shown(map: Map, frame: Frame, length: float, max_points: int) -> dict:
+def _frustum_length(map: Map, frame: Frame) -> float:
+    """In the view's unit: all frustums are equally long."""
+    poses = [image.cam_from_world() for image in map.images.values()]
+    centers = frame.apply(np.array([pose.inverse().translation for pose in poses]))
+    return _FRUSTUM_LENGTH * float(np.median(np.linalg.norm(centers, axis=1)))
+
+
+def _points(map: Map, frame: Frame, max_points: int) -> dict[str, str]:
     rows = _evenly(len(map.point3D_ids), max_points)
     return {
         "points": _base64(frame.apply(map.points3D_in_world[rows]).astype("<f4")),
         "colors": _base64(map.colors[rows]),
-        "images": [_frustum(map, name, frame, length) for name in map.images],
     }
 
 

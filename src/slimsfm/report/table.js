@@ -1,9 +1,10 @@
 "use strict";
 // A click on a header sorts its table: numbers largest first, text alphabetically, a second click reversed.
+// A filter above a table leaves the rows that hold all its words.
 for (const table of document.querySelectorAll("table")) {
   const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
   heads.forEach((head, column) => head.addEventListener("click", () => {
-    const numeric = body.rows[0].cells[column].classList.contains("number");
+    const numeric = head.classList.contains("number");
     const first = numeric ? "descending" : "ascending", second = numeric ? "ascending" : "descending";
     const order = head.getAttribute("aria-sort") === first ? second : first;
     heads.forEach(other => other.removeAttribute("aria-sort"));
@@ -11,6 +12,15 @@ for (const table of document.querySelectorAll("table")) {
     const sign = order === "ascending" ? 1 : -1;
     body.append(...[...body.rows].sort((a, b) => sign * compare(a.cells[column], b.cells[column], numeric, sign)));
   }));
+  const filter = table.parentElement.parentElement.querySelector(".filter");
+  filter?.addEventListener("input", () => {
+    const words = filter.value.toLowerCase().split(/\s+/);
+    for (const row of body.rows) {
+      const names = [...row.cells].filter(cell => !cell.classList.contains("number"));
+      const text = names.map(cell => cell.textContent.toLowerCase()).join(" ");
+      row.hidden = !words.every(word => text.includes(word));
+    }
+  });
 }
 
 function compare(a, b, numeric, sign) {

@@ -1,108 +1,125 @@
-"""The paper's table as HTML: a click on a header sorts it."""
+"""Tables as HTML: a click on a header sorts them, words in a field filter them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from slimsfm.evaluation.metrics import ADD_FRACTIONS, DEG_CM, SURE
+from slimsfm.evaluation.columns import Column, columns
+from slimsfm.evaluation.comparison import Key
+from slimsfm.evaluation.formats import is_metric
 from slimsfm.evaluation.table import Row
-from slimsfm.report.words import number, size
+
+_MARKED = ' class="marked"'
+_MANY = 12  # rows, from which on a filter is worth its place
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of the table."""
+class Head:
+    """The header of a column."""
 
     title: str
-    """Its header."""
+    """What stands there."""
 
     meaning: str
-    """Its header at length, shown when pointed at."""
+    """The same at length, shown when pointed at."""
 
-    key: str
-    """Name of its value in `Row.to_json`."""
-
-    show: Callable[[float], str]
-    """How a value is written."""
+    is_number: bool = True
+    """Whether the column is sorted by value, not by text."""
 
 
-def _decimal(value: float) -> str:
-    return f"{value:.1f}"
+@dataclass(frozen=True)
+class Value:
+    """A number in a table."""
+
+    text: str
+    """As it is written."""
+
+    value: float | int | None
+    """What it is sorted by; None, which comes last, where there is no number."""
+
+    aside: str = ""
+    """Small print below it."""
 
 
-def _percent(value: float) -> str:
-    return f"{100 * value:.1f}"
+NOTHING = Value("\N{EN DASH}", None)
+"""Where a table has no value."""
+
+_STRATEGY = Head("Strategy", "how queries are matched", is_number=False)
+_VARIANT = Head("Map", "which variant of the map", is_number=False)
+_METHOD = Head("Method", "local features, and what matches them", is_number=False)
+_OBJECT = Head("Object", "which object, or which average", is_number=False)
 
 
-def _percent_of_d(value: float) -> str:
-    return f"{100 * value:.2f} %"
+def table_html(
+    heads: Sequence[Head], lines: Sequence[Sequence[str | Value]], marked: Sequence[int] = ()
+) -> str:
+    """A table.
+
+    Args:
+        heads: The header of each column.
+        lines: The cells of each row: numbers, or text that already is HTML.
+        marked: Rows that stand out, by index.
+    """
+    head = "".join(
+        f'<th scope="col"{_class(one.is_number)} title="{escape(one.meaning)}">'
+        f"<button>{escape(one.title)}</button></th>"
+        for one in heads
+    )
+    body = "\n".join(
+        f"<tr{_MARKED * (i in marked)}>{''.join(_cell(one) for one in line)}</tr>"
+        for i, line in enumerate(lines)
+    )
+    table = f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+    if len(lines) <= _MANY:
+        return table
+    return (
+        '<div><input class="filter" type="search" aria-label="Show rows with these words" '
+        f'placeholder="Show rows with: direct default">{table}</div>'
+    )
 
 
-_MAP = (
-    Column("Images", "reference images of the map", "references", number),
-    Column("Points", "3D points of the map", "points", number),
-    Column("Map size", "size of the map on disk", "map_bytes", size),
-)
-
-_METRIC = tuple(
-    Column(f"{n}°-{n}cm", f"% of queries within {n}° and {n} cm", f"{n}deg_{n}cm", _decimal) for n in DEG_CM
-)
-
-_RELATIVE = (
-    *(
-        Column(
-            f"ADD-{share}d",
-            f"% of queries with a mean box corner error below {share} of the diagonal d",
-            f"add_{share}d",
-            _decimal,
-        )
-        for share in ADD_FRACTIONS
-    ),
-    Column("Median error", "median corner error, in % of d", "median_corner_error", _percent_of_d),
-)
-
-_TRUST = (
-    Column(
-        "Wrong when sure",
-        "% beyond 0.1 of the diagonal among poses with confidence over 0.9",
-        f"confidence_wrong_at_{SURE}",
-        _percent,
-    ),
-    Column(
-        "Tried", "reference images that a query was matched with, on average", "references_tried", _decimal
-    ),
-)
-
-_SPEED = (
-    Column("Extract ms", "milliseconds a query: its features", "ms_extract", _decimal),
-    Column("Match ms", "milliseconds a query: matching", "ms_match", _decimal),
-    Column("Pose ms", "milliseconds a query: pose search", "ms_pose", _decimal),
-    Column("FPS", "queries a second, all stages together", "fps", _decimal),
-)
+def _class(is_number: bool) -> str:
+    return ' class="number"' if is_number else ""
 
 
-def table_html(rows: Sequence[Row]) -> str:
-    """The rows as a table; what has no value shows as a dash and sorts last."""
-    metric = any(row.scores.deg_cm is not None for row in rows)
-    columns = (*_MAP, *(_METRIC if metric else ()), *_RELATIVE, *_TRUST, *_SPEED)
-    heads = [_head("Strategy", "how queries are matched"), _head("Map", "which variant of the map")]
-    heads += [_head(column.title, column.meaning) for column in columns]
-    lines = "\n".join(f"<tr>{_cells(row, columns)}</tr>" for row in rows)
-    head = f"<thead><tr>{''.join(heads)}</tr></thead>"
-    return f'<div class="scroll"><table>{head}\n<tbody>{lines}</tbody></table></div>'
+def _cell(cell: str | Value) -> str:
+    if isinstance(cell, str):
+        return f"<td>{cell}</td>"
+    value = "" if cell.value is None else f' data-value="{cell.value:.9g}"'
+    aside = f"<small>{escape(cell.aside)}</small>" if cell.aside else ""
+    return f'<td class="number"{value}>{escape(cell.text)}{aside}</td>'
 
 
-def _head(title: str, meaning: str) -> str:
-    return f'<th scope="col" title="{escape(meaning)}"><button>{escape(title)}</button></th>'
+def rows_html(rows: Sequence[Row], marked: Sequence[Key] = ()) -> str:
+    """The paper's table, with 95 % intervals in small print; what has no value shows as a dash.
+
+    Args:
+        rows: Of one object, or of averages.
+        marked: Lines that stand out.
+    """
+    shown = columns(metric=is_metric(rows))
+    texts = [(_STRATEGY, lambda row: row.strategy), (_VARIANT, lambda row: row.variant)]
+    if len({row.method for row in rows}) > 1:
+        texts.insert(0, (_METHOD, lambda row: row.method))
+    if len({row.object for row in rows}) > 1:
+        texts.insert(0, (_OBJECT, lambda row: row.object))
+    lines = [
+        [*(escape(text(row)) for _, text in texts), *(_value(row.to_json(), one) for one in shown)]
+        for row in rows
+    ]
+    heads = [*(head for head, _ in texts), *(Head(one.title, one.meaning) for one in shown)]
+    stand_out = [i for i, row in enumerate(rows) if (row.method, row.strategy, row.variant) in marked]
+    return table_html(heads, lines, stand_out)
 
 
-def _cells(row: Row, columns: Sequence[Column]) -> str:
-    values = row.to_json()
-    texts = "".join(f"<td>{escape(text)}</td>" for text in (row.strategy, row.variant))
-    return texts + "".join(_cell(values.get(column.key), column.show) for column in columns)
-
-
-def _cell(value: float | None, show: Callable[[float], str]) -> str:
+def _value(values: dict, column: Column) -> Value:
+    value = values.get(column.key)
     if value is None:
-        return '<td class="number">&ndash;</td>'
-    return f'<td class="number" data-value="{value:.9g}">{escape(show(value))}</td>'
+        return NOTHING
+    low, high = values.get(f"{column.key}_low"), values.get(f"{column.key}_high")
+    aside = "" if low is None or high is None else f"{_short(low)}\N{EN DASH}{_short(high)}"
+    return Value(column.show(value), value, aside)
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.1f}"

@@ -1,9 +1,11 @@
 "use strict";
 // Draws a map in 3D on a plain canvas: points through a depth buffer, then images and box as lines.
 // The frame: origin in the box's centre, z up, unit the box's diagonal.
+// A map is shown once its section is open; until then its data stay text.
 
 const FOCAL = 1.3;   // over the canvas's shorter side
 const NEAR = 0.02;
+const FEW = 3000;    // points, and fewer, are drawn larger
 
 function decode(text, Type) {
   const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
@@ -15,7 +17,8 @@ function eye(state) {
   const cy = Math.cos(state.yaw), sy = Math.sin(state.yaw);
   const cp = Math.cos(state.pitch), sp = Math.sin(state.pitch);
   return {
-    right: [-sy, cy, 0], down: [cy * sp, sy * sp, -cp], back: [cy * cp, sy * cp, sp], distance: state.distance,
+    right: [-sy, cy, 0], down: [cy * sp, sy * sp, -cp], back: [cy * cp, sy * cp, sp],
+    distance: state.distance, shift: state.shift,
   };
 }
 
@@ -23,14 +26,15 @@ function drawPoints(context, width, height, view, focal, map, dot) {
   const picture = context.createImageData(width, height);
   const colors = new Uint32Array(picture.data.buffer), depths = new Float32Array(width * height).fill(Infinity);
   const { right: r, down: d, back: b } = view, p = map.points, c = map.colors;
+  const least = (p.length < 3 * FEW ? 3.5 : 1.5) * dot, most = 2 * least + 2 * dot;
   for (let i = 0; i < p.length; i += 3) {
     const x = p[i], y = p[i + 1], z = p[i + 2];
     const depth = view.distance - (b[0] * x + b[1] * y + b[2] * z);
     if (depth < NEAR) continue;
-    const u = width / 2 + focal * (r[0] * x + r[1] * y + r[2] * z) / depth;
-    const v = height / 2 + focal * (d[0] * x + d[1] * y + d[2] * z) / depth;
+    const u = width / 2 + focal * ((r[0] * x + r[1] * y + r[2] * z) / depth - view.shift[0]);
+    const v = height / 2 + focal * ((d[0] * x + d[1] * y + d[2] * z) / depth - view.shift[1]);
     if (!(u > -9 && v > -9 && u < width + 9 && v < height + 9)) continue;
-    const size = Math.round(Math.min(5 * dot, Math.max(1.5 * dot, 0.006 * focal / depth)));
+    const size = Math.round(Math.min(most, Math.max(least, 0.006 * focal / depth)));
     const color = 0xff000000 | c[i + 2] << 16 | c[i + 1] << 8 | c[i];
     const left = Math.round(u - size / 2), top = Math.round(v - size / 2);
     for (let row = Math.max(0, top); row < Math.min(height, top + size); row++) {
@@ -55,22 +59,33 @@ function line(context, width, height, view, focal, from, to) {
     const share = (NEAR - seen[own][2]) / (seen[other][2] - seen[own][2]);
     seen[own] = seen[own].map((value, k) => value + share * (seen[other][k] - value));
   }
-  const place = ([x, y, z]) => [width / 2 + focal * x / z, height / 2 + focal * y / z];
+  const [right, down] = view.shift;
+  const place = ([x, y, z]) => [width / 2 + focal * (x / z - right), height / 2 + focal * (y / z - down)];
   context.moveTo(...place(seen[0]));
   context.lineTo(...place(seen[1]));
 }
 
-// The distance from which the box and all images of both maps are in the picture.
+// The distance from which, and the shift by which, the box and all images just fill the picture.
 function fit(canvas, scene, state) {
   const { right, down, back } = eye(state), focal = FOCAL * Math.min(canvas.clientWidth, canvas.clientHeight);
   const dot = (axis, point) => axis[0] * point[0] + axis[1] * point[1] + axis[2] * point[2];
-  let distance = 0.2;
-  for (const point of [...scene.box, ...scene.before.images.flat(), ...scene.after.images.flat()]) {
-    const across = Math.abs(dot(right, point)) / canvas.clientWidth;
-    const along = Math.abs(dot(down, point)) / canvas.clientHeight;
-    distance = Math.max(distance, dot(back, point) + focal * Math.max(across, along) / 0.48);
+  const points = [...scene.box, ...scene.images.flat()];
+  const extent = (axis, distance) => {
+    const places = points.map(point => dot(axis, point) / (distance - dot(back, point)));
+    return [Math.min(...places), Math.max(...places)];
+  };
+  const fits = (axis, distance, side) => {
+    const [low, high] = extent(axis, distance);
+    return focal * (high - low) < 0.94 * side;
+  };
+  let near = NEAR + Math.max(...points.map(point => dot(back, point))), far = 200;
+  for (let step = 0; step < 30; step++) {
+    const middle = (near + far) / 2;
+    if (fits(right, middle, canvas.clientWidth) && fits(down, middle, canvas.clientHeight)) far = middle;
+    else near = middle;
   }
-  return distance;
+  const middle = axis => extent(axis, far).reduce((low, high) => (low + high) / 2);
+  return { distance: far, shift: [middle(right), middle(down)] };
 }
 
 function draw(canvas, scene, state) {
@@ -79,7 +94,7 @@ function draw(canvas, scene, state) {
   const height = Math.max(1, Math.round(canvas.clientHeight * dot));
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   const context = canvas.getContext("2d"), style = getComputedStyle(canvas);
-  const view = eye(state), focal = FOCAL * Math.min(width, height), map = scene[state.show];
+  const view = eye(state), focal = FOCAL * Math.min(width, height), map = scene.maps[state.show];
   drawPoints(context, width, height, view, focal, map, dot);
   const lines = (color, thickness, alpha, pairs) => {
     context.beginPath();
@@ -90,11 +105,12 @@ function draw(canvas, scene, state) {
     context.stroke();
     context.globalAlpha = 1;
   };
-  const frusta = wanted => map.images.filter((_, k) => map.chosen[k] === wanted).flatMap(
+  const frustums = images => images.map(k => scene.images[k]).flatMap(
     ([o, a, b, c, d]) => [[o, a], [o, b], [o, c], [o, d], [a, b], [b, c], [c, d], [d, a]]);
   lines("--box", 1.5, 0.9, scene.edges.map(([i, j]) => [scene.box[i], scene.box[j]]));
-  lines("--dropped", 1, 0.7, frusta(0));
-  lines("--chosen", 1.8, 1, frusta(1));
+  lines("--dropped", 1, 0.7, frustums(map.images.filter(k => !scene.chosen[k])));
+  lines("--chosen", 1.8, 1, frustums(map.images.filter(k => scene.chosen[k])));
+  if (state.lit !== null) lines("--ink", 3.5, 1, frustums([state.lit]));
 }
 
 // Drag turns, two fingers or the wheel zoom, arrow keys and + - do the same.
@@ -143,17 +159,17 @@ function listen(canvas, state, reset, redraw) {
   });
 }
 
-for (const place of document.querySelectorAll(".view")) {
-  const canvas = place.querySelector("canvas"), buttons = place.querySelectorAll("[data-show]");
+function start(place) {
+  const canvas = place.querySelector("canvas"), buttons = [...place.querySelectorAll("[data-show]")];
   const scene = JSON.parse(place.querySelector("script").textContent);
-  for (const map of [scene.before, scene.after]) {
+  for (const map of Object.values(scene.maps)) {
     map.points = decode(map.points, Float32Array);
     map.colors = decode(map.colors, Uint8Array);
   }
-  const state = { show: "before" };
+  const state = { show: buttons[0].dataset.show, lit: null };
   const reset = () => {
     Object.assign(state, { yaw: 0.5, pitch: 0.4, moved: false });
-    state.distance = fit(canvas, scene, state);
+    Object.assign(state, fit(canvas, scene, state));
   };
   let waiting = false;
   const redraw = () => {
@@ -161,7 +177,6 @@ for (const place of document.querySelectorAll(".view")) {
     waiting = true;
     requestAnimationFrame(() => { waiting = false; draw(canvas, scene, state); });
   };
-  reset();
   listen(canvas, state, reset, redraw);
   for (const button of buttons) {
     button.addEventListener("click", () => {
@@ -170,6 +185,16 @@ for (const place of document.querySelectorAll(".view")) {
       redraw();
     });
   }
-  new ResizeObserver(() => { if (!state.moved) reset(); redraw(); }).observe(canvas);
+  place.parentElement.addEventListener("image", event => { state.lit = event.detail; redraw(); });
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  return { resized: () => { if (!state.moved) reset(); redraw(); } };
+}
+
+for (const place of document.querySelectorAll(".view")) {
+  let view = null;
+  new ResizeObserver(([entry]) => {
+    if (!entry.contentRect.width) return;
+    view ??= start(place);
+    view.resized();
+  }).observe(place.querySelector("canvas"));
 }

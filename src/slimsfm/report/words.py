@@ -1,70 +1,92 @@
 """What reducing a map gained and cost, in words."""
 
 from collections.abc import Sequence
+from math import isfinite
 
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.columns import number, size
+from slimsfm.evaluation.comparison import Comparison, Key
+from slimsfm.evaluation.formats import p_value
+from slimsfm.evaluation.results import MappedObject
 from slimsfm.mapping.map import Map
 
+__all__ = [
+    "contents",
+    "difference",
+    "domination",
+    "gain",
+    "line_name",
+    "number",
+    "percent_of_d",
+    "plural",
+    "ratio",
+    "size",
+]
 
-def number(value: float | int) -> str:
-    """A count, or a mean of counts, with its thousands marked."""
-    return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.1f}"
+_EQUAL = "1.0"
 
 
-def size(num_bytes: float | int) -> str:
-    """A size on disk in the unit that suits it; 1 kB is 1000 bytes."""
-    value, units = float(num_bytes), ["B", "kB", "MB", "GB"]
-    while value >= 999.5 and len(units) > 1:
-        value, units = value / 1000, units[1:]
-    return f"{value:.1f} {units[0]}" if value < 10 and units[0] != "B" else f"{value:.0f} {units[0]}"
+def plural(count: int, word: str) -> str:
+    """A count and what it counts."""
+    words = f"{word[:-1]}ies" if word.endswith("y") else f"{word}s"
+    return f"{number(count)} {word if count == 1 else words}"
 
 
 def contents(map: Map) -> str:
     """How much a map holds."""
-    images, points = len(map.images), f"{number(len(map.point3D_ids))} points"
-    if map.is_for_direct_matching:
-        return points
-    return f"{number(images)} image{'s' * (images != 1)}, {points}"
+    points = plural(len(map.point3D_ids), "point")
+    return points if map.is_for_direct_matching else f"{plural(len(map.images), 'image')}, {points}"
 
 
-def headline(full: Map, reduced: Map, rows: Sequence[Row]) -> str:
-    """One sentence: what became of the map, its accuracy and its speed.
+def line_name(key: Key, methods: Sequence[str] = ()) -> str:
+    """A line of the table: map and strategy, and where there are several methods which one."""
+    method, strategy, variant = key
+    name = f"{variant} map, {strategy}"
+    return f"{method}: {name}" if len(methods) > 1 else name
 
-    Accuracy, speed and size are left out where the rows do not tell them for both maps.
-    """
-    pair = compared(rows)
-    if pair is None:
-        return f"{contents(full)} → {contents(reduced)}."
-    before, after = pair
-    add = [f"{row.scores.add[0.1]:.1f} %" for row in pair]
+
+def gain(one: Comparison) -> str:
+    """One sentence on a slim map: what it saves, and what accuracy that costs."""
     return (
-        f"{contents(full)}, {size(before.map_bytes)} → {contents(reduced)}, {size(after.map_bytes)}; "
-        f"ADD-0.1d {add[0]} → {add[1]}, matching and pose {_speed(before, after)}."
+        f"{ratio(one.smaller, 'smaller', 'larger')}, {ratio(one.faster, 'faster', 'slower')}; "
+        f"ADD-0.1d {one.add_before:.1f} % → {one.add_after:.1f} %"
     )
 
 
-def compared(rows: Sequence[Row]) -> tuple[Row, Row] | None:
-    """The full map's row and that of the slim map, or None.
-
-    What `slimsfm reduce` gives by itself, for direct matching, stands against the full map matched
-    exhaustively; where it was not measured, dominating images against the full map under the same strategy.
-    """
-    by_label = {(row.strategy, row.variant): row for row in rows}
-    pairs = [(("exhaustive", "full"), ("direct", "default"))]
-    pairs += [((row.strategy, "full"), (row.strategy, "dominating")) for row in rows]
-    for before, after in pairs:
-        if before in by_label and after in by_label:
-            return by_label[before], by_label[after]
-    return None
+def difference(one: Comparison) -> str:
+    """How sure the change in accuracy is: a 95 % interval, and the probability that it is chance."""
+    return (
+        f"difference {_signed(one.add_gain.low)} to {_signed(one.add_gain.high)} points, "
+        f"p {p_value(one.p_value)}"
+    )
 
 
-def _speed(before: Row, after: Row) -> str:
-    old, new = (row.scores.seconds.match + row.scores.seconds.pose for row in (before, after))
-    if old <= 0 or new <= 0:
-        return "not timed"
-    return _ratio(old / new, "faster") if old >= new else _ratio(new / old, "slower")
+def _signed(value: float) -> str:
+    return f"{value:+.1f}".replace("-", "\N{MINUS SIGN}")
 
 
-def _ratio(ratio: float, word: str) -> str:
-    rounded = f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}"
-    return "equally fast" if rounded == "1.0" else f"{rounded}\N{MULTIPLICATION SIGN} {word}"
+def ratio(value: float, more: str, less: str) -> str:
+    """How many times more or less, to two digits."""
+    if value < 1:
+        value, more = 1 / value, less
+    rounded = f"{value:.0f}" if value >= 10 else f"{value:.1f}"
+    return f"equally {_STEMS[more]}" if rounded == _EQUAL else f"{rounded}\N{MULTIPLICATION SIGN} {more}"
+
+
+_STEMS = {"smaller": "small", "larger": "large", "faster": "fast", "slower": "fast"}
+
+
+def domination(mapped: MappedObject) -> str:
+    """One sentence on an object's dominating set."""
+    count = len(mapped.dominating_set)
+    least = "no fewer can" if mapped.lower_bound >= count else f"no fewer than {mapped.lower_bound} can"
+    return (
+        f"{number(count)} of {plural(mapped.references, 'image')} dominate the others ({least}); they see "
+        f"{number(mapped.dominating_points)} of {plural(mapped.points, 'point')}."
+    )
+
+
+def percent_of_d(error: float) -> str:
+    """A relative error, or that there is no pose."""
+    return (
+        f"{100 * error:.1f}\N{NO-BREAK SPACE}% of\N{NO-BREAK SPACE}d" if isfinite(error) else "not localized"
+    )

@@ -1,0 +1,42 @@
+"""`slimsfm report`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from slimsfm.cli.output import OutputPath, Stopwatch, finish, parse
+from slimsfm.errors import InputError
+from slimsfm.evaluation.result_files import read_run
+from slimsfm.files import check_writable
+from slimsfm.report import write_report
+
+
+def report(
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")],
+    /,
+    output: OutputPath,
+    overwrite: bool = False,
+) -> None:
+    """Show a run of `slimsfm benchmark` on one HTML page: what was kept, what it costs, where it fails.
+
+    The page needs no network and nothing beside it.
+
+    Args:
+        run: Folder of a run, with its maps.
+        output: The page.
+        overwrite: Replace what is there.
+    """
+    watch = Stopwatch()
+    check_writable(output, overwrite=overwrite)
+    measured = read_run(run)
+    if not measured.objects:
+        raise InputError(f"{run}: no object could be measured; run slimsfm benchmark again")
+    write_report(output, measured, overwrite=overwrite)
+    finish(str(output), watch)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the command."""
+    parse(report, arguments)

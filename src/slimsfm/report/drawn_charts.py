@@ -1,0 +1,51 @@
+"""Charts as parts of the page."""
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from slimsfm.evaluation.comparison import Comparison
+from slimsfm.evaluation.outcomes import join
+from slimsfm.evaluation.table import BY_FRAME
+from slimsfm.report.charts import (
+    frontier_chart,
+    query_places,
+    reference_places,
+    reliability_chart,
+    sphere_chart,
+)
+from slimsfm.report.figures import figure_svg
+from slimsfm.report.opened import OpenedObject
+from slimsfm.report.story import Story
+
+_CSS_PX = 96  # to an inch
+
+
+def average_charts(story: Story, lines: Sequence[Comparison]) -> str:
+    """Charts over all objects; `lines` are those that headlines are about."""
+    figures = [frontier_chart(story.rows[BY_FRAME])]
+    if lines:
+        cells = [cell for one in story.run.objects if (cell := one.cell(*lines[0].after))]
+        figures.append(reliability_chart(join([cell.outcomes for cell in cells])))
+    return _charts(figures)
+
+
+def object_charts(opened: OpenedObject, story: Story, lines: Sequence[Comparison]) -> str:
+    """Charts of one object; `lines` are those that headlines are about."""
+    result = opened.result
+    figures = [frontier_chart(story.rows[result.name])]
+    if lines:
+        cells = [cell for key in (lines[0].before, lines[0].after) if (cell := result.cell(*key))]
+        before, after = (cell.trials[0].outcomes for cell in cells)
+        reduced = opened.maps.get("dominating", opened.maps["full"])
+        places = reference_places(opened.maps["full"], reduced), query_places(result.queries, before, after)
+        figures += [sphere_chart(result.box, *places), reliability_chart(cells[1].outcomes)]
+    return _charts(figures)
+
+
+def _charts(figures: Sequence[Figure]) -> str:
+    drawn = "\n".join(
+        f'<div class="chart" style="--width: {_CSS_PX * one.get_figwidth():.0f}px">{figure_svg(one)}</div>'
+        for one in figures
+    )
+    return f'<div class="charts">\n{drawn}\n</div>'
