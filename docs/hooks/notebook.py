@@ -1,0 +1,44 @@
+"""The notebook of the examples as a page of the site."""
+
+import base64
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+NOTEBOOK = "examples/slimsfm.ipynb"
+PAGE = "walkthrough.md"
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the page and its pictures."""
+    path = Path(config.config_file_path).parent / NOTEBOOK
+    parts: list[str] = []
+    for part in parts_of(json.loads(path.read_text(encoding="utf-8"))):
+        if isinstance(part, bytes):
+            name = f"walkthrough/{sum(one.startswith('![') for one in parts) + 1}.png"
+            files.append(File.generated(config, name, content=part))
+            part = f"![What the lines above draw](../docs/{name})"
+        parts.append(part)
+    parts.append(f'All of it as a notebook: <a href="{NOTEBOOK}" download><code>slimsfm.ipynb</code></a>.')
+    files.append(File.generated(config, PAGE, content="\n\n".join(parts) + "\n"))
+    return files
+
+
+def parts_of(notebook: dict[str, Any]) -> Iterator[str | bytes]:
+    """Text of the page in order; pictures, PNG, as bytes."""
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            yield source
+            continue
+        yield f"```python\n{source}\n```"
+        for output in cell["outputs"]:
+            data = output.get("data", {"text/plain": output.get("text", "")})
+            if "image/png" in data:
+                yield base64.b64decode("".join(data["image/png"]))
+            elif "text/plain" in data:
+                yield f"```text\n{''.join(data['text/plain']).rstrip()}\n```"

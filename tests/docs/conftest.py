@@ -1,0 +1,116 @@
+import importlib.util
+import shutil
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pycolmap
+import pytest
+from PIL import Image
+
+from slimsfm.cli.output import quiet
+from slimsfm.features.methods import plugins
+from slimsfm.mapping.build import build_map
+from slimsfm.mapping.hloc import write_hloc
+from slimsfm.mapping.io import write_map
+from slimsfm.mapping.map import Map
+from slimsfm.synthetic.scene import mapping_take
+from slimsfm.tracking.video import write_video
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+
+FILM, FRAMES = (
+    160,
+    15,
+)  # frames all around the object, and those of them that are rendered
+FRAMES_PER_SECOND = 4.0  # so that two frames a second are the photos
+NEW = (5, 11)
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as the how-tos want it: `photos/`, `new/` and `video.mp4` of a rendered object."""
+    pytest.importorskip("av", reason="needs PyAV to film, which is not installed")
+    folder = tmp_path_factory.mktemp("filmed")
+    take = mapping_take("printed_box", FILM, 320, 240, seed=0)
+    frames = [take.frame(index) for index in range(FRAMES)]
+    for name in ("photos", "new"):
+        (folder / name).mkdir()
+    for index in range(0, FRAMES, 2):
+        Image.fromarray(frames[index]).save(folder / "photos" / f"{index:02d}.png")
+    for index in NEW:
+        Image.fromarray(frames[index]).save(folder / "new" / f"{index:02d}.png")
+    with write_video(folder / "video.mp4", FRAMES_PER_SECOND) as write:
+        for frame in frames:
+            write(frame)
+    focal, *center = take.camera.params[1:]
+    (folder / "camera.txt").write_text(f"1 PINHOLE 320 240 {focal} {focal} {' '.join(map(str, center))}\n")
+    shutil.copytree(ROOT / "examples" / "own_matcher", folder / "own_matcher")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def hook() -> Callable[[str], ModuleType]:
+    """Loads a hook of the site, as mkdocs does, by the name of its file."""
+
+    def load(name: str) -> ModuleType:
+        for needed in ("mkdocs", "latex2mathml"):
+            pytest.importorskip(needed, reason=f"needs {needed}: pip install 'slimsfm[docs]'")
+        spec = importlib.util.spec_from_file_location(name, DOCS / "hooks" / f"{name}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def projects(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What is made of the photos: `map`, COLMAP's `project/`, hloc's `outputs/` and `queries.txt`, a box."""
+    folder = tmp_path_factory.mktemp("projects")
+    with quiet():
+        made = build_map(filmed / "photos", folder / "work").map
+    write_map(made, folder / "map")
+    shutil.copytree(folder / "map" / "sparse", folder / "project" / "sparse" / "0")
+    shutil.copytree(filmed / "photos", folder / "project" / "images")
+    _write_database(folder / "work" / "database.db", made, folder / "project" / "database.db")
+    write_hloc(made, folder / "outputs")
+    (folder / "outputs" / "features.h5").rename(folder / "outputs" / "feats-sift.h5")
+    camera = (filmed / "camera.txt").read_text().split()[1:]
+    lines = [" ".join([path.name, *camera]) for path in sorted((filmed / "new").iterdir())]
+    (folder / "queries.txt").write_text("\n".join(lines) + "\n")
+    corners = [" ".join(f"{value:.6f}" for value in corner) for corner in made.box.corners]
+    (folder / "box3d_corners.txt").write_text("\n".join(corners) + "\n")
+    return folder
+
+
+def _write_database(working: Path, made: Map, path: Path) -> None:
+    """The working database of a map as COLMAP would have left it, with the images' names."""
+    working.rename(path)
+    names = {image.image_id: name for name, image in made.images.items()}
+    with pycolmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            image.name = names.get(image.image_id, f"left-out-{image.name}")
+            database.update_image(image)
+
+
+@pytest.fixture
+def own_matcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """What `pip install ./own_matcher` would put beside the module: the entry points of its project file."""
+    source = ROOT / "examples" / "own_matcher"
+    project = tomllib.loads((source / "pyproject.toml").read_text())["project"]
+    told = tmp_path / f"own_matcher-{project['version']}.dist-info"
+    told.mkdir()
+    (told / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
+    (offered,) = project["entry-points"]["slimsfm.matchers"].items()
+    (told / "entry_points.txt").write_text(f"[slimsfm.matchers]\n{' = '.join(offered)}\n")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), str(source), *sys.path])
+    plugins.cache_clear()
+    yield
+    plugins.cache_clear()
+    sys.modules.pop("own_matcher", None)
