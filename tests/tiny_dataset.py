@@ -22,7 +22,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar
 
-OPTIONS = BenchmarkOptions(strategies=("direct",), variants=("full", "dominating", "points:100", "random:2"))
+OPTIONS = BenchmarkOptions(strategies=("direct",), variants=("full", "dominating", "points:100"))
 FAILURES = {
     "input": InputError("its box is missing"),
     "bug": RuntimeError("it is broken"),

@@ -66,17 +66,20 @@ def test_the_curves_show_every_way_twice(drawn):
     _, data, curves = drawn
     root = ElementTree.fromstring(curves)
     assert root.tag == f"{SVG}svg"
-    circles = list(root.iter(f"{SVG}circle"))
-    assert sum(circle.get("r") == "2.5" for circle in circles) == 2 * len(data["candidates"])
-    assert sum(circle.get("r") == "7" for circle in circles) == 2 * 2
-    assert len(list(root.iter(f"{SVG}polyline"))) == 2 * 3
     said = " ".join(text.text for text in root.iter(f"{SVG}text"))
-    for words in ("direct: kcover", "direct: dominating", "images: dominating", "recommended"):
+    for words in ("direct: kcover", "direct: dominating", "images: dominating", "recommended", "full map"):
         assert words in said
     width, height = map(float, root.get("viewBox").split()[2:])
-    for circle in circles:
-        assert 0 <= float(circle.get("cx")) <= width
-        assert 0 <= float(circle.get("cy")) <= height
+    marks = [(float(one.get("x")), float(one.get("y"))) for one in root.iter(f"{SVG}use")]
+    assert len(marks) >= 2 * len(data["candidates"]) + 2 * 2
+    assert all(0 <= x <= width and 0 <= y <= height for x, y in marks)
+
+
+def test_curves_of_an_unknown_format_are_refused_before_any_work(exact_path, tmp_path):
+    refusal = slimsfm("frontier", exact_path, *FEW, "--curves", tmp_path / "curves.doc")
+    assert refusal.code == 2
+    assert ".svg, .png, .pdf" in refusal.err
+    assert not (exact_path / "graph-matches.npz").exists()
 
 
 def test_it_changes_nothing_but_for_a_graph_that_is_kept(exact_path):

@@ -18,7 +18,7 @@ from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.reduction import ReductionOptions, keep_random_images
 
 OPTIONS = BenchmarkOptions(strategies=("exhaustive", "direct"))
-SPAN, QUERIES = range(12, 22), (14, 19)
+SPAN, QUERIES = range(14, 22), (16, 19)
 
 
 def frames_of(sequence, numbers):
@@ -33,7 +33,7 @@ def frames_of(sequence, numbers):
 
 @pytest.fixture(scope="module")
 def sequences(boulder):
-    """Ten neighbouring frames of the rendered object, two of them queries, whose map is yet to be built."""
+    """Eight neighbouring frames of the rendered object, two of them queries, whose map is yet to be built."""
     return ObjectSequences(
         name="boulder",
         mapping=frames_of(boulder.mapping, [one for one in SPAN if one not in QUERIES]),
@@ -75,7 +75,7 @@ def test_the_object_is_told_as_it_was_given(result, sequences):
 def test_queries_are_localized_well_against_the_full_map(result):
     for strategy in OPTIONS.strategies:
         outcomes = result.cell("sift", strategy, "full").outcomes
-        assert (outcomes.error < 0.02).all()
+        assert (outcomes.error < 0.05).all()
         assert (outcomes.confidence > 0.5).all()
 
 
@@ -103,7 +103,7 @@ def test_the_dominating_set_dominates_the_graph_that_is_kept(result, bench):
     assert labels == []  # read, not computed
     chosen = [graph.names.index(name) for name in mapped.dominating_set]
     assert dominates(graph.adjacency(), chosen)
-    assert mapped.lower_bound == len(chosen) < mapped.references == len(full.images) == 8
+    assert mapped.lower_bound == len(chosen) < mapped.references == len(full.images) == 6
     assert mapped.edges == graph.num_edges(0.05)
     assert mapped.points == len(full.point3D_ids)
 
@@ -152,16 +152,16 @@ def again(bench, result, tmp_path):
     assert result.maps
     shutil.copytree(kept(bench, "full"), map_path(tmp_path, "boulder", "sift", "full"))
 
-    def measure(sequences, **options):
-        options = {"strategies": ("direct",), "variants": ("dominating",)} | options
-        return benchmark_object(sequences, Bench(folder=tmp_path, options=BenchmarkOptions(**options)))
+    def measure(sequences, variants=("dominating",), reduction=ReductionOptions()):
+        options = BenchmarkOptions(strategies=("direct",), variants=variants, reduction=reduction)
+        return benchmark_object(sequences, Bench(folder=tmp_path, options=options))
 
     return measure
 
 
 def test_the_threshold_of_the_reduction_is_obeyed(again, sequences):
     found = again(sequences, reduction=ReductionOptions(threshold=1e-12))
-    assert len(found.maps[0].dominating_set) == found.maps[0].references == 8
+    assert len(found.maps[0].dominating_set) == found.maps[0].references == 6
     assert found.maps[0].edges == 0
 
 
@@ -183,13 +183,12 @@ def test_an_object_with_a_model_is_measured_by_its_vertices(again, sequences, re
 
 def test_random_variants_of_several_sizes_do_not_get_into_each_others_way(again, sequences):
     """They lie at temporary places, and a map reads its features when it needs them."""
-    both = again(sequences, variants=("random:2", "random:3"))
-    for cell in both.cells:
-        count = int(cell.variant[-1])
-        assert [trial.references for trial in cell.trials] == [count] * 5
-        (alone,) = again(sequences, variants=(cell.variant,)).cells
-        for one, other in zip(cell.trials, alone.trials, strict=True):
-            assert one.outcomes.error.tolist() == other.outcomes.error.tolist()
+    two, three = again(sequences, variants=("random:2", "random:3")).cells
+    assert [trial.references for trial in two.trials] == [2] * 5
+    assert [trial.references for trial in three.trials] == [3] * 5
+    (alone,) = again(sequences, variants=("random:2",)).cells
+    for one, other in zip(two.trials, alone.trials, strict=True):
+        assert one.outcomes.error.tolist() == other.outcomes.error.tolist()
 
 
 def test_maps_are_built_with_the_features_of_the_method(tmp_path):

@@ -148,7 +148,8 @@ def assert_balanced(latex):
 
 def body_of(latex):
     """The lines of the tabular, as cells."""
-    lines = re.search(r"\\toprule\n(.*)\\bottomrule", latex, flags=re.DOTALL)[1].split("\\\\\n")
+    (body,) = re.findall(r"\\toprule\n(.*)\\bottomrule", latex, flags=re.DOTALL)
+    lines = body.split("\\\\\n")
     return [[cell.strip() for cell in re.split(r"(?<!\\)&", line)] for line in lines[:-1]]
 
 

@@ -236,5 +236,5 @@ def test_only_sure_poses_count_as_wrong_when_sure():
 
 def test_errors_cannot_be_changed():
     with pytest.raises(AttributeError):
-        NO_POSE.rotation_deg = 0.0
+        NO_POSE.rotation_deg = 0.0  # pyright: ignore[reportAttributeAccessIssue]
     assert replace(NO_POSE, rotation_deg=0.0).rotation_deg == 0.0

@@ -131,27 +131,18 @@ def interrupted():
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("stage", ["localize 7 pairs", "find usable points"])
-def test_an_interrupted_run_goes_on_and_finds_the_same(whole, dataset, tmp_path, stage):
-    """Interrupted in the middle of the second object, whichever stage that is at."""
-    folder = tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
-        run_benchmark(dataset, bench_in(folder, progress=doing_at(stage, 2, interrupted)))
-    done = state_of(folder, "can")
-    assert not object_path(folder, "mug").exists()
-    run = run_benchmark(dataset, bench_in(folder))
-    assert state_of(folder, "can") == done
-    assert_equal_runs(run, whole)
-
-
-def test_a_run_interrupted_while_it_reads_an_object_goes_on_with_it(whole, breakable, tmp_path):
+def test_a_run_that_is_interrupted_again_and_again_finds_the_same(whole, breakable, tmp_path):
+    """While it reads its second object, computes the graph, and chooses points."""
     folder = tmp_path / "run"
     break_object(breakable, "mug", "interrupt")
     with pytest.raises(KeyboardInterrupt):
         run_benchmark(breakable, bench_in(folder))
-    done = state_of(folder, "can")
-    assert sorted(path.name for path in (folder / "objects").iterdir()) == ["can.json"]
     mend(breakable, "mug")
+    done = state_of(folder, "can")
+    for stage in ("localize 7 pairs", "find usable points"):
+        with pytest.raises(KeyboardInterrupt):
+            run_benchmark(breakable, bench_in(folder, progress=doing_at(stage, 1, interrupted)))
+        assert [path.name for path in (folder / "objects").iterdir()] == ["can.json"]
     run = run_benchmark(breakable, bench_in(folder))
     assert state_of(folder, "can") == done
     assert_equal_runs(run, whole)

@@ -45,7 +45,8 @@ def test_the_median_is_infinite_unless_more_than_half_are_localized():
 def test_where_nothing_is_localized_everything_is_a_failure_and_nobody_was_sure():
     scores = score(outcomes_like([np.inf, np.inf]), metric=True)
     assert scores.localized == 0.0
-    assert set(scores.add.values()) == set(scores.deg_cm.values()) == {0.0}
+    assert scores.add == {0.1: 0.0, 0.05: 0.0, 0.02: 0.0}
+    assert scores.deg_cm == {1: 0.0, 3: 0.0, 5: 0.0}
     assert scores.confidence_wrong is None
 
 
@@ -56,7 +57,7 @@ def test_the_shares_are_the_percentages_query_by_query():
     assert percent == {
         "localized": scores.localized,
         **{f"add_{fraction}d": value for fraction, value in scores.add.items()},
-        **{f"{n}deg_{n}cm": value for n, value in scores.deg_cm.items()},
+        **{f"{n}deg_{n}cm": value for n, value in (scores.deg_cm or {}).items()},
     }
 
 

@@ -74,7 +74,7 @@ def sphere_chart(box: Box, references: Sequence[ReferencePlace], queries: Sequen
     return figure
 
 
-def _counts(found: Sequence[Verdict]) -> str:
+def _counts(found: Sequence[str]) -> str:
     return "queries: " + ", ".join(f"{found.count(verdict)} {verdict}" for verdict in _LOOKS)
 
 
@@ -83,7 +83,7 @@ def _draw_references(axes: Axes, places: Points2D, used: Mask) -> None:
         axes.plot(*places[some].T, ls="none", label=name, zorder=2, **_REFERENCE_LOOKS[name])
 
 
-def _draw_queries(axes: Axes, places: Points2D, found: Sequence[Verdict]) -> None:
+def _draw_queries(axes: Axes, places: Points2D, found: Sequence[str]) -> None:
     for verdict, look in _LOOKS.items():
         some = np.array([one == verdict for one in found], bool)
         axes.plot(*places[some].T, ls="none", label=verdict, zorder=3, **look)
