@@ -252,14 +252,15 @@ def test_a_run_of_the_same_options_goes_on_even_if_it_may_be_overwritten(whole, 
 def test_a_folder_of_something_else_is_refused(dataset, tmp_path, content):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / content).write_text("mine")
-    with pytest.raises(OutputError, match="run: holds "):
-        run_benchmark(dataset, bench_in(tmp_path / "run"))
+    for overwrite in (False, True):  # what is no run is nobody's to delete
+        with pytest.raises(OutputError, match="exists already and is no run"):
+            run_benchmark(dataset, bench_in(tmp_path / "run"), overwrite=overwrite)
     assert contents(tmp_path / "run") == {content: b"mine"}
 
 
 def test_a_file_is_refused(dataset, tmp_path):
     (tmp_path / "run").write_text("mine")
-    with pytest.raises(OutputError, match="run: holds something else"):
+    with pytest.raises(OutputError, match="exists already and is no run"):
         run_benchmark(dataset, bench_in(tmp_path / "run"))
     assert (tmp_path / "run").read_text() == "mine"
 
@@ -277,3 +278,19 @@ def test_a_damaged_result_of_an_object_is_named(whole, dataset, tmp_path):
     path.write_text(path.read_text()[:1000])
     with pytest.raises(InputError, match=r"mug\.json: is no result of slimsfm benchmark .*delete it"):
         run_benchmark(dataset, bench_in(tmp_path / "run"))
+
+
+def test_what_a_killed_process_left_in_the_folder_is_in_nobodys_way(dataset, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".run.json.partial").write_text("half")
+    options = replace(OPTIONS, strategies=("direct",), variants=("full",))
+    assert not run_benchmark(dataset, Bench(folder=tmp_path / "run", options=options)).failed
+
+
+def test_maps_of_an_object_that_failed_are_not_used_again(breakable, tmp_path):
+    told = breakable.path / NAMES[0] / "object.json"
+    gone = json.loads(told.read_text()) | {"photos": "nowhere"}
+    told.write_text(json.dumps(gone))  # found out when the object is mapped already
+    bench = bench_in(tmp_path / "run")
+    assert "nowhere" in run_benchmark(breakable, bench).failed[NAMES[0]]
+    assert [path.name for path in (bench.folder / "maps").iterdir()] == [NAMES[1]]

@@ -12,7 +12,7 @@ import tyro
 from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, OutputPath, Stopwatch, console, finish, parse
-from slimsfm.cli.results import print_comparisons, print_run, write_results
+from slimsfm.cli.results import print_comparisons, report_run
 from slimsfm.datasets import DATASETS
 from slimsfm.datasets.base import Dataset
 from slimsfm.errors import InputError
@@ -63,8 +63,7 @@ def benchmark(
         run = run_benchmark(dataset, bench, execution.open_executor(), shown, overwrite=overwrite)
     run = replace(run, options={"command": command, **run.options})
     if run.objects:
-        write_results(run)
-        print_run(run)
+        report_run(run)
     for name, why in run.failed.items():
         console.print(f"{name}: could not be measured: {why}", style="red")
     if run.failed:

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from slimsfm.cli.output import Stopwatch, console, finish, parse
-from slimsfm.cli.results import print_run, write_results
+from slimsfm.cli.results import report_run
 from slimsfm.datasets.synthetic import SynthesisOptions, Synthetic, synthesize
 from slimsfm.errors import OutputError
 from slimsfm.evaluation.benchmark import Bench
@@ -38,10 +38,9 @@ def demo(
     dataset = Synthetic(path=folder, objects=_OBJECTS.objects)
     bench = Bench(folder=output / "run", progress=shown)
     run = run_benchmark(dataset, bench, progress=shown, overwrite=overwrite)
-    write_results(run)
     console.print(f"mapped, reduced, localized: {watch}")
+    report_run(run)
     write_report(report, run, overwrite=True)
-    print_run(run)
     finish(f"{bench.folder / 'results.json'} and {report}", watch, "build", "PHOTOS", "-o", "MAP")
 
 

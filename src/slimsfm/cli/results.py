@@ -25,9 +25,22 @@ from slimsfm.evaluation.table import BY_FRAME, Row
 from slimsfm.files import replacing
 
 
-def write_results(run: Run) -> None:
-    """Write a run into its folder: results.json, and its table as Markdown, LaTeX and CSV."""
+def report_run(run: Run) -> None:
+    """Write a run into its folder, and print its table, what slim maps gain and lose, and dominating sets."""
     rows, comparisons = all_rows(run), against_full(run.objects)
+    _write(run, rows, comparisons)
+    print_rows(rows)
+    print_comparisons([one for one in comparisons if one.object == BY_FRAME] or comparisons)
+    for one in summarize_domination(run.objects):
+        console.print(
+            f"{one.method}: dominating sets of {one.smallest} to {one.largest} images, {one.mean:.2f} "
+            f"on average; images kept {one.images_kept_mean:.3f} (median {one.images_kept_median:.3f}), "
+            f"points kept {one.points_kept_mean:.3f} (median {one.points_kept_median:.3f})"
+        )
+
+
+def _write(run: Run, rows: Sequence[Row], comparisons: Sequence[Comparison]) -> None:
+    """results.json, and the table as Markdown, LaTeX and CSV."""
     data = run_to_json(run) | {
         "rows": [row.to_json() for row in rows],
         "comparisons": [one.to_json() for one in comparisons],
@@ -43,20 +56,6 @@ def write_results(run: Run) -> None:
         with replacing(run.folder / name, overwrite=True) as partial:
             partial.write_text(text, encoding="utf-8")
     write_json(run.folder / "results.json", data)
-
-
-def print_run(run: Run) -> None:
-    """Print the table, what slim maps gain and lose, and the sizes of dominating sets."""
-    print_rows(all_rows(run))
-    compared = against_full(run.objects)
-    overall = [one for one in compared if one.object == BY_FRAME]
-    print_comparisons(overall or compared)
-    for one in summarize_domination(run.objects):
-        console.print(
-            f"{one.method}: dominating sets of {one.smallest} to {one.largest} images, {one.mean:.2f} "
-            f"on average; images kept {one.images_kept_mean:.3f} (median {one.images_kept_median:.3f}), "
-            f"points kept {one.points_kept_mean:.3f} (median {one.points_kept_median:.3f})"
-        )
 
 
 def print_rows(rows: Sequence[Row]) -> None:

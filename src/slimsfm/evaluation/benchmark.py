@@ -101,7 +101,7 @@ def benchmark_object(sequences: ObjectSequences, bench: Bench) -> ObjectResult:
 
     A map for direct matching alone has no line for other strategies, nor one without keypoints for direct.
     """
-    queries = queries_of(sequences.query)
+    queries = [replace(query, path=query.path.resolve()) for query in queries_of(sequences.query)]
     maps, cells = [], []
     for method in bench.options.parsed_methods:
         subject = _Subject(sequences, method, bench)
@@ -114,7 +114,7 @@ def benchmark_object(sequences: ObjectSequences, bench: Bench) -> ObjectResult:
         name=sequences.name,
         box=sequences.box,
         unit=sequences.unit,
-        images=sequences.mapping.folder,
+        images=sequences.mapping.folder.resolve(),
         queries=tuple(queries),
         maps=tuple(maps),
         cells=tuple(cells),

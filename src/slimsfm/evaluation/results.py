@@ -147,4 +147,9 @@ class Run:
 
 def map_path(folder: Path, name: str, method: str, variant: str) -> Path:
     """Where a run in a folder keeps a map."""
-    return folder / "maps" / name / method / variant.replace(":", "-")
+    return maps_path(folder, name) / method / variant.replace(":", "-")
+
+
+def maps_path(folder: Path, name: str) -> Path:
+    """Where a run in a folder keeps the maps of an object."""
+    return folder / "maps" / name

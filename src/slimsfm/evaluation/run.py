@@ -17,7 +17,7 @@ from slimsfm.evaluation.result_files import (
     read_object_result,
     write_json,
 )
-from slimsfm.evaluation.results import Run
+from slimsfm.evaluation.results import Run, maps_path
 from slimsfm.execution import OpenExecutor, run_tasks
 from slimsfm.files import remove
 from slimsfm.progress import ProgressBar, silent
@@ -56,7 +56,7 @@ def run_benchmark(
         overwrite: Start anew where the folder holds a run of other options.
 
     Raises:
-        OutputError: The folder holds a run of other options, or something else, and `overwrite` is off.
+        OutputError: The folder holds a run of other options and `overwrite` is off, or something else.
         InputError: The data set has no object, or the result of one that was done is damaged.
     """
     names = dataset.names()
@@ -81,7 +81,7 @@ def object_path(folder: Path, name: str) -> Path:
 
 
 def _measure(task: _Task) -> str | None:
-    """Measure an object and write its result; returns why it could not be."""
+    """Measure an object and write its result; returns why it could not be, and then leaves no map of it."""
     try:
         sequences = task.dataset.load(task.name, task.bench.dataset_making(task.name))
         result = benchmark_object(sequences, task.bench)
@@ -89,11 +89,14 @@ def _measure(task: _Task) -> str | None:
     except OutputError:
         raise  # the folder of the run is at fault, not the object
     except SlimsfmError as error:
-        return str(error)
+        why = str(error)
     except Exception as error:  # whatever is broken in one object, the others go on
         _LOGGER.exception("%s could not be measured", task.name)
-        return f"{type(error).__name__}: {error}"
-    return None
+        why = f"{type(error).__name__}: {error}"
+    else:
+        return None
+    remove(maps_path(task.bench.folder, task.name))  # what is mended may be what they were made of
+    return why
 
 
 def _asked(dataset: Dataset, bench: Bench) -> dict:
@@ -111,30 +114,40 @@ def _claim(folder: Path, asked: dict, *, overwrite: bool) -> None:
     """Make the folder one of this run, unless it is that already.
 
     Raises:
-        OutputError: It is of another run, or of none, and `overwrite` is off.
+        OutputError: It is of another run and `overwrite` is off, or it holds something else.
     """
-    path = folder / "run.json"
-    if path.is_file() and _read(path) == asked:
+    known = _read(folder / "run.json")
+    if known == asked:
         return
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+    if known is None and folder.exists() and not _is_empty(folder):
+        raise OutputError(f"{folder}: exists already and is no run; choose another output")
+    if known is not None:
         if not overwrite:
-            what = "a run of other options" if path.is_file() else "something else"
-            raise OutputError(f"{folder}: holds {what}; choose another output or pass --overwrite")
+            raise OutputError(
+                f"{folder}: holds a run of other options; choose another output or pass --overwrite"
+            )
         remove(folder)
-    write_json(path, asked)
+    write_json(folder / "run.json", asked)
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether it is a folder that holds nothing, but perhaps what a process that was killed left."""
+    return folder.is_dir() and all(path.name.startswith(".") for path in folder.iterdir())
 
 
 def _read(path: Path) -> dict | None:
+    """What a run was of; None where there is none."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
+    return found if isinstance(found, dict) and "format" in found else None
 
 
 def _finished(dataset: Dataset, bench: Bench, names: Sequence[str], failed: dict[str, str]) -> Run:
     return Run(
         folder=bench.folder,
-        dataset=f"{type(dataset).__name__} {dataset.path.name}",
+        dataset=f"{type(dataset).__name__} {dataset.path.resolve().name}",
         options={**asdict(bench.options), "build": asdict(bench.build)},
         environment=environment(),
         objects=tuple(read_object_result(object_path(bench.folder, name)) for name in names),
