@@ -23,6 +23,7 @@ from slimsfm.evaluation.results import Run
 from slimsfm.evaluation.summary import summarize_domination
 from slimsfm.evaluation.table import BY_FRAME, Row
 from slimsfm.files import replacing
+from slimsfm.report.words import ratio
 
 
 def report_run(run: Run) -> None:
@@ -81,9 +82,10 @@ def print_rows(rows: Sequence[Row]) -> None:
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     """Say, line by line, what one map gains and what it costs against another."""
     for one in comparisons:
+        faster, smaller = ratio(one.faster, "faster", "slower"), ratio(one.smaller, "smaller", "larger")
         console.print(
-            f"{one.object}, {', '.join(one.after)}: {one.faster:.1f}x faster in matching and pose "
+            f"{one.object}, {', '.join(one.after)}: {faster} in matching and pose "
             f"({one.faster_between.low:.1f} to {one.faster_between.high:.1f}) than {', '.join(one.before)}, "
-            f"{one.smaller:.0f}x smaller; ADD-0.1d {one.add_before:.1f} -> {one.add_after:.1f} "
+            f"{smaller}; ADD-0.1d {one.add_before:.1f} -> {one.add_after:.1f} "
             f"({one.add_gain.low:+.1f} to {one.add_gain.high:+.1f}, p {p_value(one.p_value)})"
         )
