@@ -56,7 +56,7 @@ def test_wrong_inputs_are_told_in_one_line(map_path, queries, tmp_path):
         ((map_path, *out, "--queries", tmp_path / "own.txt"), "'003.png' is called as an image of the map"),
         ((map_path, "-o", map_path, "--overwrite"), "is or holds the input"),
         ((map_path, "-o", queries, "--queries", queries, "--overwrite"), "is or holds the input"),
-        ((map_path,), "see slimsfm export --help"),
+        ((map_path,), "see slimsfm export hloc --help"),
     ):
         outcome = slimsfm("export", "hloc", *arguments)
         assert outcome.code == 2

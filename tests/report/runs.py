@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from scenes import exact_map
-from slimsfm.cli.results import write_results
+from slimsfm.cli.results import report_run
 from slimsfm.evaluation.benchmark import BenchmarkOptions
 from slimsfm.evaluation.outcomes import outcomes_of
 from slimsfm.evaluation.protocol import PreparedQuery, Query, localize_all
@@ -38,7 +38,7 @@ def make_run(folder: Path, objects: Mapping[str, int]) -> Run:
         objects=tuple(_measured(folder, name, count) for name, count in sorted(objects.items())),
         failed={"jug": "there is no photo"},
     )
-    write_results(run)
+    report_run(run)
     return run
 
 
