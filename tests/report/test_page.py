@@ -148,7 +148,7 @@ def test_methods_are_named_where_there_are_several(alone):
     can = alone.objects[0]
     twice = replace(can, cells=(*can.cells, *(replace(cell, method="aliked") for cell in can.cells)))
     text = Reader(report_html(replace(alone, objects=(twice,)))).text
-    assert "the sift: default map, direct" in text
+    assert "the default map, direct, with sift, is" in text
     assert "Maps and graph are those of sift." in text
 
 

@@ -76,7 +76,7 @@ def test_a_gain_owns_up_to_its_cost():
 
 def test_lines_name_their_method_only_where_there_are_several():
     assert line_name(COMPARISON.after, ["sift"]) == "default map, direct"
-    assert line_name(COMPARISON.after, ["sift", "aliked"]) == "sift: default map, direct"
+    assert line_name(COMPARISON.after, ["sift", "aliked"]) == "default map, direct, with sift"
 
 
 def test_a_dominating_set_is_told_with_what_is_proven():

@@ -41,7 +41,7 @@ def line_name(key: Key, methods: Sequence[str] = ()) -> str:
     """A line of the table: map and strategy, and where there are several methods which one."""
     method, strategy, variant = key
     name = f"{variant} map, {strategy}"
-    return f"{method}: {name}" if len(methods) > 1 else name
+    return f"{name}, with {method}" if len(methods) > 1 else name
 
 
 def gain(one: Comparison) -> str:
