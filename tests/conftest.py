@@ -1,11 +1,17 @@
 import logging
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 from scenes import exact_map, with_matches
 from slimsfm.mapping.map import Map
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores: threads of each would collide
+    os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    threadpool_limits(1)
 
 
 @pytest.fixture(scope="session")

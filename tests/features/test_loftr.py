@@ -13,6 +13,7 @@ from slimsfm.features.loftr import Loftr  # noqa: E402
 from slimsfm.networks.loftr import coarse_tokens, confidences, make_network  # noqa: E402
 
 GOLDEN = np.load(Path(__file__).parents[1] / "networks" / "golden" / "loftr.npz")
+CLOSE = 1e-4  # of confidences: processors round differently, by up to 3e-5 so far
 BLOCKS = np.random.default_rng(2).integers(0, 256, (38, 58), dtype=np.uint8)
 PICTURE = np.kron(BLOCKS, np.ones((4, 4), np.uint8))
 IMAGE1, IMAGE2 = PICTURE[:128, :200], PICTURE[8:152, 16:200]
@@ -56,7 +57,7 @@ def test_matches_are_those_of_the_authors_code(plain):
     order = in_golden_order(found.points2D_1)
     assert np.abs(found.points2D_1[order] - 0.5 - GOLDEN["loftr_points1"]).max() < 1e-9
     assert np.abs(found.points2D_2[order] - 0.5 - GOLDEN["loftr_points2"]).max() < 1e-4
-    assert np.abs(found.scores[order] - GOLDEN["loftr_scores"]).max() < 1e-5
+    assert np.abs(found.scores[order] - GOLDEN["loftr_scores"]).max() < CLOSE
     assert np.all(np.diff(found.scores) <= 0)
 
 
@@ -64,8 +65,8 @@ def test_confidences_are_those_of_the_authors_code(plain):
     one, other = (plain.encode(image).coarse for image in (IMAGE1, IMAGE2))
     with torch.inference_mode():
         sure = confidences(coarse_tokens(plain.network, one, other)).numpy()
-    assert np.abs(sure.max(axis=1) - GOLDEN["loftr_best"]).max() < 1e-5
-    assert np.abs(sure.max(axis=0) - GOLDEN["loftr_best_of_column"]).max() < 1e-5
+    assert np.abs(sure.max(axis=1) - GOLDEN["loftr_best"]).max() < CLOSE
+    assert np.abs(sure.max(axis=0) - GOLDEN["loftr_best_of_column"]).max() < CLOSE
 
 
 def test_stages_for_maps_are_those_of_the_authors_code(for_maps):
