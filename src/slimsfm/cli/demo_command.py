@@ -16,7 +16,7 @@ from slimsfm.execution import num_cores, processes
 from slimsfm.progress import shown
 from slimsfm.report import write_report
 
-_OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=40, query_frames=24)
+_OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=32, query_frames=16)
 
 
 def demo(
