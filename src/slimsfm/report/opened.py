@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 
+from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options
 from slimsfm.evaluation.methods import parse_method
 from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.evaluation.variants import parse_variant
-from slimsfm.graph import GraphOptions, ReferenceGraph
+from slimsfm.graph import ReferenceGraph
 from slimsfm.graph.io import graph_of
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
+from slimsfm.reduction import ReductionOptions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,12 +43,10 @@ def open_object(run: Run, result: ObjectResult, method: str) -> OpenedObject:
     kept = [one for one in dict.fromkeys(("full", *variants)) if not parse_variant(one).is_random]
     maps = {variant: read_map(run.map_path(result.name, method, variant)) for variant in kept}
     threshold = run.options["reduction"]["threshold"]
-    options = GraphOptions(
-        edges=run.options["edges"],
-        candidates="all",
-        threshold=threshold,
-        matcher=parse_method(method).matcher or "auto",
-    )
+    asked = BenchmarkOptions(
+        edges=run.options["edges"], reduction=ReductionOptions(threshold=threshold)
+    )  # all that the graph depends on
+    options = graph_options(asked, parse_method(method))
     return OpenedObject(
         result=result,
         mapped=next(one for one in result.maps if one.method == method),
