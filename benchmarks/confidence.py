@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from slimsfm.evaluation.protocol import PreparedQuery
 from slimsfm.geometry import corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.describing import describe_points
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.localization.verification import RIGHT
 from slimsfm.mapping.direct import direct_map

@@ -20,7 +20,7 @@ from slimsfm.geometry import corner_error
 from slimsfm.graph import compute_graph
 from slimsfm.localization import Localizer
 from slimsfm.mapping.build import build_map
-from slimsfm.mapping.importing import import_model
+from slimsfm.mapping.importing import import_colmap
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.photos import list_images, read_image
@@ -56,10 +56,10 @@ def compare(folder: Path, temporary: Path) -> None:
         path = write_model(
             built, temporary / "build" / "database.db", temporary / form.replace(" ", "-"), form
         )
-        imported = keep_images(import_model(path), slim.images)
+        imported = keep_images(import_colmap(path), slim.images)
         print_difference(form, expected, localize(imported, folder, cameras), built)
     path = run_colmap(references, temporary / "colmap")
-    imported = import_model(path)
+    imported = import_colmap(path)
     b_from_a = pycolmap.align_reconstructions_via_proj_centers(imported.model, built.model, 0.05)
     kept = keep_images(imported, slim.images)
     found = localize(kept, folder, dict.fromkeys(queries, imported.shared_camera))

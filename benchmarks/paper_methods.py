@@ -143,7 +143,7 @@ def _described(map_: Map, made: ObjectSequences, extractor: str) -> Map:
     options = {"weights": "loftr-onepose++"} if extractor == "loftr" else {}
     info = replace(map_.info, extractor=extractor, extractor_options=options)
     small = {name: shrink_photo(photo, 640) for name, photo in photos.items()} if options else {}
-    return replace(map_, features=features, info=info, photos=small, appearance=None)
+    return replace(map_, features=features, info=info, photos=small, global_descriptors=None)
 
 
 def _by_superpoint() -> Describe:

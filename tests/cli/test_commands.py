@@ -15,7 +15,7 @@ from rendered import MAPPING_FRAMES, NAME, QUERY_FRAMES
 from slimsfm.cli import COMMANDS
 from slimsfm.domination import dominates
 from slimsfm.geometry import corner_error
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 
@@ -73,7 +73,7 @@ def test_reduce_keeps_a_dominating_set(boulder, reduced):
     assert_done(reduced.outcome, reduced.path, "localize")
     assert "proven smallest" in reduced.outcome.out
     full, slim = boulder.map, read_map(reduced.path)
-    graph = graph_of(full, reduced.graph.parent, progress=_never).graph
+    graph = load_or_compute_graph(full, reduced.graph.parent, progress=_never).graph
     kept = [graph.names.index(name) for name in slim.images]
     assert dominates(graph.adjacency(), kept)
     assert 1 <= len(kept) < MAPPING_FRAMES

@@ -11,7 +11,7 @@ from commands import contents, slimsfm
 from slimsfm import execution
 from slimsfm.domination import dominates
 from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute, compute_graph
-from slimsfm.graph.io import graph_of, read_given_graph
+from slimsfm.graph.io import load_or_compute_graph, read_given_graph
 from slimsfm.mapping.io import read_map, write_map
 
 
@@ -47,7 +47,7 @@ def test_it_says_what_the_graph_is_like_and_keeps_it(a_map, tmp_path, edges):
     done = slimsfm("graph", a_map, "--edges", edges, "-o", output, "--json", figures)
     assert (done.code, done.err.strip()) == (0, "")
     map_ = read_map(a_map)
-    run = graph_of(map_, a_map, GraphOptions(edges=edges), progress=never)
+    run = load_or_compute_graph(map_, a_map, GraphOptions(edges=edges), progress=never)
     graph, facts = run.graph, json.loads(figures.read_text())
     assert np.array_equal(read_given_graph(output, map_).dense(), graph.dense())
     degrees = graph.degrees()
@@ -131,7 +131,7 @@ def test_a_cluster_is_used(a_map, scheduler, monkeypatch):
     done = slimsfm("graph", a_map, "--edges", "tracks", "--scheduler", scheduler)
     assert done.code == 0, done.err
     map_ = read_map(a_map)
-    kept = graph_of(map_, a_map, GraphOptions(edges="tracks"), progress=never).graph
+    kept = load_or_compute_graph(map_, a_map, GraphOptions(edges="tracks"), progress=never).graph
     assert np.array_equal(kept.dense(), compute_graph(map_, GraphOptions(edges="tracks")).graph.dense())
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from commands import contents, slimsfm
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
@@ -139,7 +139,7 @@ def test_an_interrupted_graph_goes_on_where_it_stopped(boulder, start, tmp_path,
         labels.append(label)
         return iter(items)
 
-    run = graph_of(read_map(a_map), a_map, GraphOptions(edges="localize"), progress=watch)
+    run = load_or_compute_graph(read_map(a_map), a_map, GraphOptions(edges="localize"), progress=watch)
     assert int(labels[0].split()[1]) <= run.pairs_tried - (len(kept) - 65) // 24
     again = slimsfm("graph", a_map, "--edges", "localize")
     assert again.code == 0

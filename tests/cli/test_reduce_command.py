@@ -243,7 +243,7 @@ def test_a_map_built_without_a_detector_keeps_a_dominating_set_with_its_photos(b
     full = boulder.map
     photos = {name: np.full((24, 32, 3), row, np.uint8) for row, name in enumerate(full.images)}
     info = replace(full.info, extractor="loftr", extractor_options={"max_image_size": 640})
-    write_map(replace(full, photos=photos, info=info, appearance=None), tmp_path / "map")
+    write_map(replace(full, photos=photos, info=info, global_descriptors=None), tmp_path / "map")
     found = slimsfm("reduce", tmp_path / "map", "-o", tmp_path / "small")
     assert found.code == 0
     assert "dominating set" in found.out

@@ -12,7 +12,7 @@ from slimsfm.evaluation.protocol import evaluate, prepare
 from slimsfm.evaluation.results import map_path
 from slimsfm.evaluation.table import rows_of
 from slimsfm.geometry import corner_error
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.reduction import ReductionOptions, keep_random_images
@@ -99,7 +99,9 @@ def test_the_dominating_set_dominates_the_graph_that_is_kept(result, bench):
         labels.append(label)
         return iter(items)
 
-    graph = graph_of(full, path, graph_options(OPTIONS, parse_method("sift")), progress=watch).graph
+    graph = load_or_compute_graph(
+        full, path, graph_options(OPTIONS, parse_method("sift")), progress=watch
+    ).graph
     assert labels == []  # read, not computed
     chosen = [graph.names.index(name) for name in mapped.dominating_set]
     assert dominates(graph.adjacency(), chosen)

@@ -15,7 +15,7 @@ from slimsfm.errors import OutputError
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.candidates import all_pairs
 from slimsfm.graph.checkpoint import Checkpoint
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.graph.key import graph_key
 from slimsfm.mapping.io import read_map
 
@@ -86,7 +86,7 @@ def left_to_do(map_, folder, options):
         labels.append(label)
         return iter(items)
 
-    graph_of(map_, folder, options, progress=watch)
+    load_or_compute_graph(map_, folder, options, progress=watch)
     assert len(labels) == 1
     return int(labels[0].split()[1])
 
@@ -105,11 +105,11 @@ def test_progress_with_other_options_or_of_another_map_is_not_mixed_in(exact, tm
         folder = tmp_path / str(number)
         folder.mkdir()
         poisoned(folder / "graph-localize.partial", all_pairs(exact), key)
-        assert np.array_equal(graph_of(exact, folder, ALGORITHM_1).graph.dense(), expected)
+        assert np.array_equal(load_or_compute_graph(exact, folder, ALGORITHM_1).graph.dense(), expected)
     folder = tmp_path / "same"
     folder.mkdir()
     poisoned(folder / "graph-localize.partial", all_pairs(exact), graph_key(exact, ALGORITHM_1))
-    assert graph_of(exact, folder, ALGORITHM_1).graph.errors.data.tolist() == [123.0] * 30
+    assert load_or_compute_graph(exact, folder, ALGORITHM_1).graph.errors.data.tolist() == [123.0] * 30
 
 
 SMALL_BLOCKS = """

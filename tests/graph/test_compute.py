@@ -13,7 +13,7 @@ import pytest
 from scenes import ALGORITHM_1, algorithm_1
 from slimsfm.execution import dask_cluster, processes
 from slimsfm.graph import GraphOptions, GraphWork, compute, compute_graph
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import silent
@@ -46,7 +46,7 @@ def a_map(boulder, tmp_path_factory) -> Path:
 def serial(request, a_map):
     """Options of a source and the bytes of its graph, computed in this process."""
     options = GraphOptions(edges=request.param)
-    run = graph_of(read_map(a_map), a_map, options)
+    run = load_or_compute_graph(read_map(a_map), a_map, options)
     assert run.graph.num_edges() > 100
     return options, _taken(a_map)
 
@@ -59,7 +59,7 @@ def _taken(a_map):
 
 
 def computed(a_map, options, open_executor, progress=silent):
-    graph_of(read_map(a_map), a_map, options, open_executor, progress)
+    load_or_compute_graph(read_map(a_map), a_map, options, open_executor, progress)
     return _taken(a_map)
 
 

@@ -8,7 +8,7 @@ from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
 from slimsfm.graph import GraphOptions, compute
-from slimsfm.graph.io import graph_of, read_given_graph, write_graph
+from slimsfm.graph.io import load_or_compute_graph, read_given_graph, write_graph
 from slimsfm.graph.key import graph_key
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
@@ -28,7 +28,7 @@ def never(_items, label):
 
 def is_kept(map_, folder, options=ALGORITHM_1):
     try:
-        graph_of(map_, folder, options, progress=never)
+        load_or_compute_graph(map_, folder, options, progress=never)
     except AssertionError:
         return False
     return True
@@ -49,7 +49,7 @@ def test_a_graph_is_read_as_it_was_written(few_points, tmp_path):
 
 
 def test_a_damaged_graph_is_computed_again_and_never_a_wrong_one(few_points, tmp_path):
-    expected = graph_of(few_points, tmp_path, ALGORITHM_1).graph
+    expected = load_or_compute_graph(few_points, tmp_path, ALGORITHM_1).graph
     path = tmp_path / FILES[0]
     whole = path.read_bytes()
     for length in range(0, len(whole), 41):
@@ -60,7 +60,7 @@ def test_a_damaged_graph_is_computed_again_and_never_a_wrong_one(few_points, tmp
         damaged[position] ^= 1 << (position % 8)
         path.write_bytes(damaged)
         if is_kept(few_points, tmp_path):
-            assert_equal_graphs(graph_of(few_points, tmp_path, ALGORITHM_1).graph, expected)
+            assert_equal_graphs(load_or_compute_graph(few_points, tmp_path, ALGORITHM_1).graph, expected)
     path.write_bytes(whole)
     assert is_kept(few_points, tmp_path)
 
@@ -116,29 +116,29 @@ def test_the_key_of_equal_maps_is_equal(exact, tmp_path):
 )
 def test_other_options_make_another_key_and_compute_again(exact, options, tmp_path):
     options = replace(options, edges="localize")
-    graph_of(exact, tmp_path, GraphOptions(edges="localize"))
+    load_or_compute_graph(exact, tmp_path, GraphOptions(edges="localize"))
     assert graph_key(exact, options) != graph_key(exact, GraphOptions(edges="localize"))
     assert not is_kept(exact, tmp_path, options)
-    graph_of(exact, tmp_path, options)
+    load_or_compute_graph(exact, tmp_path, options)
     assert is_kept(exact, tmp_path, options)
 
 
 @pytest.mark.parametrize("edges", ["matches", "tracks", "localize"])
 def test_another_threshold_reuses_a_graph_that_does_not_depend_on_it(exact, edges, tmp_path):
-    graph_of(exact, tmp_path, GraphOptions(edges=edges))
+    load_or_compute_graph(exact, tmp_path, GraphOptions(edges=edges))
     assert is_kept(exact, tmp_path, GraphOptions(edges=edges, threshold=0.2))
 
 
 def test_hybrid_looks_closer_around_another_threshold(exact, tmp_path):
-    graph_of(exact, tmp_path, GraphOptions(edges="hybrid"))
+    load_or_compute_graph(exact, tmp_path, GraphOptions(edges="hybrid"))
     assert not is_kept(exact, tmp_path, GraphOptions(edges="hybrid", threshold=0.2))
 
 
 def test_a_graph_is_computed_once(exact, tmp_path):
-    first = graph_of(exact, tmp_path, ALGORITHM_1)
+    first = load_or_compute_graph(exact, tmp_path, ALGORITHM_1)
     path = tmp_path / FILES[0]
     before = (path.read_bytes(), path.stat().st_mtime_ns)
-    second = graph_of(exact, tmp_path, ALGORITHM_1, progress=never)
+    second = load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=never)
     assert_equal_graphs(first.graph, second.graph)
     assert_equal_graphs(first.graph, algorithm_1(exact))
     assert first.pairs_tried == second.pairs_tried == 15
@@ -151,21 +151,21 @@ def test_a_graph_is_computed_once(exact, tmp_path):
 def test_a_graph_of_each_source_is_kept_beside_the_others(exact, tmp_path):
     sources = ("matches", "tracks", "localize", "hybrid")
     for edges in sources:
-        graph_of(exact, tmp_path, GraphOptions(edges=edges))
+        load_or_compute_graph(exact, tmp_path, GraphOptions(edges=edges))
     assert all(is_kept(exact, tmp_path, GraphOptions(edges=edges)) for edges in sources)
     assert is_kept(exact, tmp_path, GraphOptions(edges="auto"))
     assert {path.name for path in tmp_path.iterdir()} == {f"graph-{edges}.npz" for edges in sources}
 
 
 def test_a_graph_of_another_map_or_a_damaged_one_is_replaced(exact, tmp_path):
-    graph_of(exact_map(num_images=3), tmp_path, ALGORITHM_1)
+    load_or_compute_graph(exact_map(num_images=3), tmp_path, ALGORITHM_1)
     expected, path = algorithm_1(exact), tmp_path / FILES[0]
-    assert_equal_graphs(graph_of(exact, tmp_path, ALGORITHM_1).graph, expected)
+    assert_equal_graphs(load_or_compute_graph(exact, tmp_path, ALGORITHM_1).graph, expected)
     path.write_bytes(path.read_bytes()[:100])
-    assert_equal_graphs(graph_of(exact, tmp_path, ALGORITHM_1).graph, expected)
-    assert_equal_graphs(graph_of(exact, tmp_path, ALGORITHM_1, progress=never).graph, expected)
+    assert_equal_graphs(load_or_compute_graph(exact, tmp_path, ALGORITHM_1).graph, expected)
+    assert_equal_graphs(load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=never).graph, expected)
     part = keep_images(exact, ["001.png", "004.png"])
-    assert graph_of(part, tmp_path, ALGORITHM_1).graph.names == ("001.png", "004.png")
+    assert load_or_compute_graph(part, tmp_path, ALGORITHM_1).graph.names == ("001.png", "004.png")
 
 
 def test_an_interruption_leaves_no_graph_but_its_progress(exact, tmp_path, monkeypatch):
@@ -177,7 +177,7 @@ def test_an_interruption_leaves_no_graph_but_its_progress(exact, tmp_path, monke
         raise KeyboardInterrupt(label)
 
     with pytest.raises(KeyboardInterrupt):
-        graph_of(exact, tmp_path, ALGORITHM_1, progress=interrupt)
+        load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=interrupt)
     assert [path.name for path in tmp_path.iterdir()] == ["graph-localize.partial"]
     labels = []
 
@@ -185,7 +185,7 @@ def test_an_interruption_leaves_no_graph_but_its_progress(exact, tmp_path, monke
         labels.append(label)
         return iter(items)
 
-    resumed = graph_of(exact, tmp_path, ALGORITHM_1, progress=watch)
+    resumed = load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=watch)
     left = 15 - (2 + 1) - 2  # the first run kept its trial and one block, and the second had a trial, too
     assert labels == [f"localize {left} pairs from each other, 1 at a time"]
     assert_equal_graphs(resumed.graph, algorithm_1(exact))

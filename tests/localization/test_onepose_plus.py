@@ -16,7 +16,7 @@ from slimsfm.geometry import corner_error, project  # noqa: E402
 from slimsfm.localization import onepose_plus  # noqa: E402
 from slimsfm.localization.crop import crop_region, region_of_box  # noqa: E402
 from slimsfm.localization.onepose_plus import ObjectFinder, OnePosePlus  # noqa: E402
-from slimsfm.localization.strategy import Cropping, PointMatches, Query, Strategy  # noqa: E402
+from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy  # noqa: E402
 from slimsfm.mapping.map import Map  # noqa: E402
 from slimsfm.mapping.subset import keep_images  # noqa: E402
 from slimsfm.networks.loftr import make_network  # noqa: E402
@@ -152,8 +152,8 @@ def test_a_query_without_an_image_has_no_matches(plain):
 def test_it_is_a_strategy_that_crops_and_expects_nothing(plain):
     strategy = OnePosePlus(plain)
     assert isinstance(strategy, Strategy)
-    assert isinstance(strategy, Cropping)
-    descriptors, points = strategy.expected(VIEW)
+    assert isinstance(strategy, PoseGuided)
+    descriptors, points = strategy.visible_points(VIEW)
     assert len(descriptors) == len(points) == 0
 
 

@@ -6,8 +6,8 @@ import pytest
 from scenes import BOX, exact_map
 from slimsfm.errors import MapError
 from slimsfm.geometry import Box
-from slimsfm.localization.describing import describe_points
 from slimsfm.localization.onepose_points import OnePosePointsOptions, prepare_points
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images

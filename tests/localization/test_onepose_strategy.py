@@ -18,7 +18,7 @@ from slimsfm.localization.crop import region_of_box  # noqa: E402
 from slimsfm.localization.direct import Direct  # noqa: E402
 from slimsfm.localization.onepose import OnePose  # noqa: E402
 from slimsfm.localization.search import Search  # noqa: E402
-from slimsfm.localization.strategy import Cropping, Query, Strategy  # noqa: E402
+from slimsfm.localization.strategy import PoseGuided, Query, Strategy  # noqa: E402
 from slimsfm.mapping.map import Map  # noqa: E402
 from slimsfm.mapping.subset import keep_images  # noqa: E402
 from slimsfm.networks.onepose import GraphAttentionMatcher, mutual_matches  # noqa: E402
@@ -185,7 +185,7 @@ def test_with_any_weights_equal_queries_get_equal_matches(scene, extractor, made
     monkeypatch.setattr(onepose, "mutual_matches", partial(mutual_matches, threshold=0.0))
     one, two = OnePose(scene), OnePose(scene)
     assert isinstance(one, Strategy)
-    assert isinstance(one, Cropping)
+    assert isinstance(one, PoseGuided)
     of = query(scene, extractor)
     for a, b in zip(all_rounds(one, of, scene), all_rounds(two, of, scene), strict=True):
         assert len(a) == len(np.unique(a.points)) > 5
@@ -241,7 +241,7 @@ def test_a_map_of_one_image_is_enough(scene, extractor):
 
 
 def test_what_a_camera_should_see_is_what_direct_matching_says(scene):
-    for a, b in zip(OnePose(scene).expected(VIEW), Direct(scene).expected(VIEW), strict=True):
+    for a, b in zip(OnePose(scene).visible_points(VIEW), Direct(scene).visible_points(VIEW), strict=True):
         assert np.array_equal(a, b)
 
 

@@ -15,8 +15,8 @@ from scenes import BOX, camera, poses
 from slimsfm.features import Features, unit_rows
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
-from slimsfm.localization.describing import describe_points
 from slimsfm.localization.localizer import load_strategy
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Strategy, unite
 from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.map import Map
@@ -136,7 +136,7 @@ def test_what_a_camera_should_see_it_does_see(exact, options):
     strategy = strategy_of(exact, options)
     for name, image in exact.images.items():
         for agreeing in (None, exact.observations[name].points[:20]):
-            expected, points = strategy.expected(image.cam_from_world(), agreeing)
+            expected, points = strategy.visible_points(image.cam_from_world(), agreeing)
             assert len(expected) == len(points) > 0
             assert np.allclose(expected, descriptors_of_points(exact)[points], atol=1e-5)
             assert np.isin(points, exact.observations[name].points).all()

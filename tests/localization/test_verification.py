@@ -8,8 +8,8 @@ from scenes import camera, exact_map, poses
 from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.describing import describe_points
 from slimsfm.localization.landmarks import choose_landmarks
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.verification import WEIGHTS, Evidence
 from slimsfm.mapping.map import observed
 

@@ -12,7 +12,7 @@ from slimsfm.features import unit_rows
 from slimsfm.geometry import corner_error
 from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.describing import describe_points
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import PointDescriptors, check_map

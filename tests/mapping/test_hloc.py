@@ -15,7 +15,7 @@ from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import corner_error
 from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.hloc import read_query_names, write_hloc
-from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.map import PointDescriptors
 from slimsfm.mapping.subset import Selection, keep_images
 
@@ -161,7 +161,7 @@ def test_floats_stay_as_they_are(exported):
 def test_an_import_of_the_export_is_the_map_again(exported):
     map_, path = exported.map, exported.path
     files = ImportOptions(features=path / "features.h5", matches=path / "matches.h5")
-    back = import_model(path / "sfm", files)
+    back = import_colmap(path / "sfm", files)
     for (a, b), pairs in map_.matches.items():
         assert np.array_equal(back.matches[a, b], pairs)
     for name, features in map_.features.items():

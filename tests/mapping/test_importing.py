@@ -13,7 +13,7 @@ from PIL import Image
 from slimsfm.errors import ImageError, InputError, ModelError
 from slimsfm.features import unit_rows
 from slimsfm.localization.localizer import Localizer
-from slimsfm.mapping.importing import ImportOptions, _frames, import_model
+from slimsfm.mapping.importing import ImportOptions, _frames, import_colmap
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.photos import read_image
 from slimsfm.synthetic.scene import mapping_take
@@ -106,7 +106,7 @@ def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, po
     if "old" in kind:
         for path in [*model.glob("rigs.*"), *model.glob("frames.*")]:
             path.unlink()
-    map_ = import_model(model, ImportOptions(database=project.folder / "database.db"))
+    map_ = import_colmap(model, ImportOptions(database=project.folder / "database.db"))
     assert list(map_.images) == list(original.images)
     assert np.array_equal(map_.point3D_ids, original.point3D_ids)
     assert np.array_equal(map_.points3D_in_world, original.points3D_in_world)
@@ -126,7 +126,7 @@ def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, po
 
 def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable):
     before = rows_of(editable.folder / "database.db")
-    map_ = import_model(editable.model)
+    map_ = import_colmap(editable.model)
     assert len(map_.matches) > 5
     assert map_.info.box_source == "estimated"
     assert "database" in map_.info.origin
@@ -139,9 +139,9 @@ def test_a_model_without_a_database_says_what_else_there_is(editable):
     with pytest.raises(
         InputError, match=r"no database\.db beside the model.*--database.*--features.*--images"
     ):
-        import_model(editable.model)
+        import_colmap(editable.model)
     with pytest.raises(InputError, match="no such database"):
-        import_model(editable.model, ImportOptions(database=editable.folder / "database.db"))
+        import_colmap(editable.model, ImportOptions(database=editable.folder / "database.db"))
 
 
 @pytest.mark.parametrize("damage", ["text", "cut", "empty", "other"])
@@ -150,7 +150,7 @@ def test_a_damaged_database_is_an_input_error(editable, damage):
     whole = path.read_bytes()
     path.write_bytes({"text": b"hello", "cut": whole[:20_000], "empty": b"", "other": whole[:100]}[damage])
     with pytest.raises(InputError, match=r"database\.db"):
-        import_model(editable.model)
+        import_colmap(editable.model)
 
 
 def test_a_database_of_other_images_is_a_model_error(editable, posed):
@@ -159,7 +159,7 @@ def test_a_database_of_other_images_is_a_model_error(editable, posed):
     with pycolmap.Database.open(path) as database:
         database.write_camera(posed.build.map.shared_camera)
     with pytest.raises(ModelError, match=r"database\.db: has no descriptors of image 'take 1/frame 0\.png'"):
-        import_model(editable.model)
+        import_colmap(editable.model)
 
 
 def test_features_of_another_run_are_a_model_error(editable):
@@ -174,16 +174,16 @@ def test_features_of_another_run_are_a_model_error(editable):
         del group["descriptors"]
         group["descriptors"] = shorter
     with pytest.raises(ModelError, match=r"frame 3\.png' has \d+ keypoints in the model but \d+ in the feat"):
-        import_model(editable.model, ImportOptions(features=path))
+        import_colmap(editable.model, ImportOptions(features=path))
     with h5py.File(path, "r+") as file:
         del file["take 1/frame 3.png"]
     with pytest.raises(ModelError, match=r"features\.h5: has no features of image 'take 1/frame 3\.png'"):
-        import_model(editable.model, ImportOptions(features=path))
+        import_colmap(editable.model, ImportOptions(features=path))
 
 
 def test_files_of_hloc_give_the_same_poses_and_their_wrong_matches_go(project, posed):
     options = ImportOptions(features=project.folder / "features.h5", matches=project.folder / "matches.h5")
-    map_, original = import_model(project.model, options), posed.build.map
+    map_, original = import_colmap(project.model, options), posed.build.map
     for name in original.images:
         assert map_.features[name].descriptors.dtype == np.float16
         assert map_.features[name].keypoints == pytest.approx(original.features[name].keypoints, abs=1e-4)
@@ -204,16 +204,16 @@ def test_matches_of_keypoints_that_are_not_there_are_named(editable):
         next(iter(next(iter(file.values())).values()))["matches0"][0] = 30_000
     options = ImportOptions(features=editable.folder / "features.h5", matches=editable.folder / "matches.h5")
     with pytest.raises(ModelError, match=r"matches\.h5.*keypoint"):
-        import_model(editable.model, options)
+        import_colmap(editable.model, options)
 
 
 def test_features_without_matches_give_a_map_without(project):
-    map_ = import_model(project.model, ImportOptions(features=project.folder / "features.h5"))
+    map_ = import_colmap(project.model, ImportOptions(features=project.folder / "features.h5"))
     assert map_.matches == {}
 
 
 def test_keypoints_are_described_again_from_the_images(project, posed, rendered):
-    map_ = import_model(project.model, ImportOptions(images=rendered.folder))
+    map_ = import_colmap(project.model, ImportOptions(images=rendered.folder))
     cosines = []
     for name, seen in posed.build.map.observations.items():
         one, two = (unit_rows(m.features[name].descriptors[seen.rows]) for m in (map_, posed.build.map))
@@ -231,15 +231,15 @@ def test_images_that_are_missing_or_of_another_size_are_named(project, rendered,
     with pytest.raises(
         ImageError, match=r"frame 2\.png: 320x200 pixels, but its camera in the model has 320x240"
     ):
-        import_model(project.model, ImportOptions(images=folder))
+        import_colmap(project.model, ImportOptions(images=folder))
     path.write_text("hello")
     with pytest.raises(ImageError, match=r"frame 2\.png: not a readable image"):
-        import_model(project.model, ImportOptions(images=folder))
+        import_colmap(project.model, ImportOptions(images=folder))
     path.unlink()
     with pytest.raises(ImageError, match=r"frame 2\.png: no such image"):
-        import_model(project.model, ImportOptions(images=folder))
+        import_colmap(project.model, ImportOptions(images=folder))
     with pytest.raises(InputError, match="no such folder of images"):
-        import_model(project.model, ImportOptions(images=tmp_path / "missing"))
+        import_colmap(project.model, ImportOptions(images=tmp_path / "missing"))
 
 
 def test_images_of_something_else_are_a_model_error(project, rendered, tmp_path):
@@ -247,7 +247,7 @@ def test_images_of_something_else_are_a_model_error(project, rendered, tmp_path)
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.fromarray(np.full((240, 320, 3), 90, np.uint8)).save(tmp_path / name)
     with pytest.raises(ModelError, match=r"at only 0 of the .* keypoints"):
-        import_model(project.model, ImportOptions(images=tmp_path))
+        import_colmap(project.model, ImportOptions(images=tmp_path))
 
 
 def test_a_model_without_points_is_a_model_error(project, tmp_path):
@@ -256,12 +256,12 @@ def test_a_model_without_points_is_a_model_error(project, tmp_path):
         model.delete_point3D(i)
     model.write_binary(tmp_path)
     with pytest.raises(ModelError, match="no 3D points; triangulate it first"):
-        import_model(tmp_path, ImportOptions(database=project.folder / "database.db"))
+        import_colmap(tmp_path, ImportOptions(database=project.folder / "database.db"))
 
 
 def test_a_given_box_is_taken(project, rendered, tmp_path):
     np.savetxt(tmp_path / "box3d_corners.txt", rendered.known.box.corners)
-    map_ = import_model(project.model, ImportOptions(box=tmp_path / "box3d_corners.txt"))
+    map_ = import_colmap(project.model, ImportOptions(box=tmp_path / "box3d_corners.txt"))
     assert map_.info.box_source == "given"
     assert map_.box.diagonal == pytest.approx(rendered.known.box.diagonal)
 

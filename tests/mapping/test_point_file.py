@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from slimsfm.errors import InputError, MapError
 from slimsfm.features import unit_rows
-from slimsfm.localization.describing import describe_points
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import PointDescriptors

@@ -10,7 +10,7 @@ from scenes import exact_map
 from slimsfm.features import unit_rows
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import Prediction, Trials, trial
-from slimsfm.selection.left_out import LeftOut
+from slimsfm.selection.leave_one_out import LeftOut
 
 LOST_AT_MOST = 0.5
 

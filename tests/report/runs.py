@@ -17,7 +17,7 @@ from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Run, Tr
 from slimsfm.evaluation.variants import Making, parse_variant
 from slimsfm.geometry import project
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
@@ -51,7 +51,7 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
     asked = names[1::3]
     write_map(keep_images(truth, [one for one in names if one not in asked]), base / "full")
     full = read_map(base / "full")
-    graph = graph_of(full, base / "full", GraphOptions(edges="localize", candidates="all")).graph
+    graph = load_or_compute_graph(full, base / "full", GraphOptions(edges="localize", candidates="all")).graph
     solution = dominating_set(graph, ReductionOptions(), full)
     making = Making(map=full, graph=graph, reduction=ReductionOptions(), solution=solution, weigh=weigh_map)
     queries = [_query(truth, photos, one) for one in asked]

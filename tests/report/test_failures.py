@@ -5,7 +5,7 @@ import numpy as np
 from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.report.failures import changes, failures_html
 from slimsfm.report.queries import worth_seeing
-from slimsfm.report.story import story_of
+from slimsfm.report.report_data import story_of
 
 
 def outcomes_like(outcomes: Outcomes, errors, confidences) -> Outcomes:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from commands import Outcome, contents, slimsfm
 from slimsfm.evaluation.result_files import read_run
-from slimsfm.report.film import DrawnQuery, drawn_queries, film_frame
+from slimsfm.report.query_video import DrawnQuery, drawn_queries, film_frame
 
 SHARED = ("frontier", "reliability-sift")
 OF_METHOD = ("before-after", "graph", "sphere", "reliability")

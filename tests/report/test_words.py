@@ -6,7 +6,7 @@ import pytest
 from slimsfm.evaluation.comparison import Comparison
 from slimsfm.evaluation.results import MappedObject
 from slimsfm.evaluation.statistics import Interval
-from slimsfm.report.words import (
+from slimsfm.report.formatting import (
     contents,
     difference,
     domination,

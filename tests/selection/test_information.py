@@ -12,9 +12,9 @@ from slimsfm.geometry import project
 from slimsfm.pose import RansacOptions, estimate_pose
 from slimsfm.selection import information
 from slimsfm.selection.information import _Choice
-from slimsfm.selection.left_out import LeftOut
+from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import PRIOR_SIGMA, corner_errors
-from slimsfm.selection.views import selection_problem
+from slimsfm.selection.usable_points import selection_problem
 
 quick = settings(deadline=None, max_examples=40)
 

@@ -5,11 +5,11 @@ import pytest
 
 from scenes import exact_map
 from slimsfm.features import unit_rows
-from slimsfm.localization.describing import describe_points
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.map import observed
 from slimsfm.mapping.subset import keep_images
-from slimsfm.selection.left_out import LeftOut
-from slimsfm.selection.views import selection_problem
+from slimsfm.selection.leave_one_out import LeftOut
+from slimsfm.selection.usable_points import selection_problem
 
 
 @pytest.fixture(scope="module")

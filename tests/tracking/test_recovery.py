@@ -7,7 +7,7 @@ from scenes import camera, poses
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking import Tracker, TrackerOptions
-from slimsfm.tracking.recovery import Recovery
+from slimsfm.tracking.relocalization import Recovery
 
 BLACK = np.zeros((480, 640, 3), np.uint8)
 CAMERA = camera()

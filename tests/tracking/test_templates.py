@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from pictures import cloth, grid
 from slimsfm.geometry import project
+from slimsfm.tracking.gray_frame import View
 from slimsfm.tracking.templates import cut_out, find, joined, spread
-from slimsfm.tracking.view import View
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[300.0, 300.0, 160.0, 120.0])
 DISTANCE = 3.0

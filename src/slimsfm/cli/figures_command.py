@@ -30,8 +30,8 @@ from slimsfm.report.charts import (
     sphere_chart,
 )
 from slimsfm.report.figures import save_figure
-from slimsfm.report.film import FRAMES_PER_SECOND, drawn_queries, film_frame, save_jpeg
-from slimsfm.report.opened import OpenedObject, open_object
+from slimsfm.report.query_video import FRAMES_PER_SECOND, drawn_queries, film_frame, save_jpeg
+from slimsfm.report.run_maps import OpenedObject, open_object
 from slimsfm.tracking.video import check_format, write_video
 
 _THUMBNAIL_PX = 128

@@ -11,7 +11,7 @@ from slimsfm.cli.output import Flat, MapPath, Stopwatch, check_output, console, 
 from slimsfm.errors import InputError
 from slimsfm.files import replacing
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.graph.source import Edges
 from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map
 from slimsfm.mapping.map import check_has_features
@@ -55,7 +55,9 @@ def frontier_of(
     graph = None
     if "images" in comparison.uses:
         with resumable():
-            graph = graph_of(full, map, GraphOptions(edges=edges), execution.open_executor(), shown).graph
+            graph = load_or_compute_graph(
+                full, map, GraphOptions(edges=edges), execution.open_executor(), shown
+            ).graph
     found = frontier(full, graph, weigh_map, comparison, shown)
     tried = {one.choice.use for one in found.candidates}
     recommended = {use: recommend(found, use) for use in comparison.uses if use in tried}

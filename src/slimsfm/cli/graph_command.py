@@ -13,7 +13,7 @@ from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, MapPath, Stopwatch, console, finish, parse
 from slimsfm.files import check_writable, replacing
 from slimsfm.graph import GraphOptions, GraphRun
-from slimsfm.graph.io import graph_of, write_graph
+from slimsfm.graph.io import load_or_compute_graph, write_graph
 from slimsfm.graph.recall import estimate_recall
 from slimsfm.graph.source import resolve
 from slimsfm.mapping.io import read_map
@@ -51,7 +51,7 @@ def graph(
             check_writable(path, overwrite=overwrite)
     map_ = read_map(map)
     with resumable():
-        run = graph_of(map_, map, edges, execution.open_executor(), shown)
+        run = load_or_compute_graph(map_, map, edges, execution.open_executor(), shown)
     figures = _figures(run, edges.threshold)
     for name, value in figures.items():
         console.print(f"{name:<20} {value}")

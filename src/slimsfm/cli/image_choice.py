@@ -8,7 +8,7 @@ from slimsfm.cli.output import console
 from slimsfm.domination import Solution
 from slimsfm.errors import InputError
 from slimsfm.graph import GraphOptions, ReferenceGraph
-from slimsfm.graph.io import graph_of, read_given_graph
+from slimsfm.graph.io import load_or_compute_graph, read_given_graph
 from slimsfm.graph.source import Edges
 from slimsfm.mapping.io import weigh_map
 from slimsfm.mapping.map import Map
@@ -83,7 +83,7 @@ class ByImages:
             given["solver"] = "random"
         return ReductionOptions(rim=self.rim, seed=seed, **given)
 
-    def graph_of(self, full: Map, path: Path, execution: Execution) -> ReferenceGraph:
+    def load_or_compute_graph(self, full: Map, path: Path, execution: Execution) -> ReferenceGraph:
         """The reference graph to choose by."""
         if self.graph:
             return read_given_graph(self.graph, full)
@@ -91,7 +91,7 @@ class ByImages:
         if self.paper:
             edges = GraphOptions(edges="localize", candidates="all")
         with resumable():
-            return graph_of(full, path, edges, execution.open_executor(), shown).graph
+            return load_or_compute_graph(full, path, edges, execution.open_executor(), shown).graph
 
     def choose(self, full: Map, path: Path, wish: Wish, seed: int, execution: Execution) -> tuple[str, ...]:
         """The names of the images to keep.
@@ -111,7 +111,7 @@ class ByImages:
             options = replace(self.options(seed), max_images=wish.max_images)
         except ValueError as error:
             raise InputError(str(error)) from error
-        return _dominating(full, self.graph_of(full, path, execution), options, wish)
+        return _dominating(full, self.load_or_compute_graph(full, path, execution), options, wish)
 
 
 def _dominating(full: Map, graph: ReferenceGraph, options: ReductionOptions, wish: Wish) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from slimsfm.cli.output import (
     finish_map,
     parse,
 )
-from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
 
@@ -35,7 +35,7 @@ def import_(
     """
     watch = Stopwatch()
     check_output(output, model, overwrite=overwrite)
-    made = import_model(model, source, progress=shown)
+    made = import_colmap(model, source, progress=shown)
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")
     finish_map(made, output, watch)

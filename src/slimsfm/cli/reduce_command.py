@@ -113,7 +113,7 @@ def _chosen(full: Map, path: Path, choosing: Choosing, execution: Execution) -> 
             options = replace(options, selectors=(choosing.selector,))
         if wish.max_points:
             options = replace(options, budgets=(*options.budgets, wish.max_points))
-        graph = by.graph_of(full, path, execution) if "images" in compared else None
+        graph = by.load_or_compute_graph(full, path, execution) if "images" in compared else None
         found = frontier(full, graph, weigh_map, options, shown)
         chosen |= {use: recommend(found, use, wish) for use in compared}
     return chosen

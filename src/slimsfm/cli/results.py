@@ -23,7 +23,7 @@ from slimsfm.evaluation.results import Run
 from slimsfm.evaluation.summary import summarize_domination
 from slimsfm.evaluation.table import BY_FRAME, Row
 from slimsfm.files import replacing
-from slimsfm.report.words import ratio
+from slimsfm.report.formatting import ratio
 
 
 def report_run(run: Run) -> None:

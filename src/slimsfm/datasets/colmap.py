@@ -16,7 +16,7 @@ from slimsfm.datasets.base import Making, ObjectSequences
 from slimsfm.datasets.images import query_names, sequences_of
 from slimsfm.datasets.reading import check_known, image_size, read_text
 from slimsfm.errors import ImageError, InputError
-from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.map import Map
 
 
@@ -62,7 +62,7 @@ class Colmap:
     def load(self, name: str, making: Making) -> ObjectSequences:
         """Import the model, and hold the queries out."""
         check_known(name, self.names(), self.path)
-        truth = import_model(self.path, self._import_options(), making.progress)
+        truth = import_colmap(self.path, self._import_options(), making.progress)
         for one in truth.images:
             self._check_image(truth, one)
         listed = self.queries

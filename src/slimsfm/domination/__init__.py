@@ -4,10 +4,10 @@ from slimsfm.domination.cpsat import cpsat
 from slimsfm.domination.exact import exact
 from slimsfm.domination.greedy import greedy
 from slimsfm.domination.order import cover_order
-from slimsfm.domination.parts import Adjacency
 from slimsfm.domination.problem import DominationProblem, dominates
 from slimsfm.domination.random_greedy import random_greedy
 from slimsfm.domination.solution import Solution, Solver
+from slimsfm.domination.validation import Adjacency
 
 SOLVERS: dict[str, Solver] = {
     "cpsat": cpsat,

@@ -5,9 +5,9 @@ from time import perf_counter
 import numpy as np
 
 from slimsfm.domination.cover import Cover, cover_of, dual_bound, split
-from slimsfm.domination.kernel import reduced
 from slimsfm.domination.lazy import lazy_greedy, without_redundant
 from slimsfm.domination.local_search import improved
+from slimsfm.domination.presolve import reduced
 from slimsfm.domination.problem import DominationProblem
 from slimsfm.domination.solution import Bounds, Solution, rounded_up, solution_of
 from slimsfm.domination.swaps import least_error_by_swaps

@@ -7,8 +7,8 @@ from scipy.sparse import csr_array, vstack
 
 from slimsfm.domination.cover import Cover
 from slimsfm.domination.lazy import lazy_greedy
-from slimsfm.domination.parts import canonical_nodes
 from slimsfm.domination.problem import DominationProblem
+from slimsfm.domination.validation import canonical_nodes
 
 
 def cover_order(problem: DominationProblem, *, first: Iterable[int] = ()) -> tuple[int, ...]:

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array, vstack
 
 from slimsfm.arrays import Ids
-from slimsfm.domination import parts
-from slimsfm.domination.parts import Adjacency
+from slimsfm.domination import validation
+from slimsfm.domination.validation import Adjacency
 
 TOLERANCE = 1e-9
 """Relative difference of two sums of costs or errors that counts as none."""
@@ -77,23 +77,23 @@ class DominationProblem:
         groups: Adjacency | None = None,
         errors: Adjacency | None = None,
     ) -> None:
-        closed = parts.canonical_adjacency(adjacency)
+        closed = validation.canonical_adjacency(adjacency)
         n = len(closed.indptr) - 1
         if dominators < 1:
             raise ValueError(f"dominators must be at least 1, got {dominators}")
         fields = {
             "adjacency": closed,
-            "costs": parts.canonical_costs(costs, n),
+            "costs": validation.canonical_costs(costs, n),
             "dominators": dominators,
             "budget": budget,
-            "forced_in": parts.canonical_nodes("forced_in", forced_in, n),
-            "forced_out": parts.canonical_nodes("forced_out", forced_out, n),
-            "groups": parts.canonical_groups(groups, n),
-            "errors": None if errors is None else parts.canonical_errors(errors, closed),
+            "forced_in": validation.canonical_nodes("forced_in", forced_in, n),
+            "forced_out": validation.canonical_nodes("forced_out", forced_out, n),
+            "groups": validation.canonical_groups(groups, n),
+            "errors": None if errors is None else validation.canonical_errors(errors, closed),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        parts.check_forced(self.forced_in, self.forced_out, self.groups)
+        validation.check_forced(self.forced_in, self.forced_out, self.groups)
         if budget is not None and not budget >= self.cost(self.forced_in):
             forced = self.cost(self.forced_in)
             raise ValueError(f"budget must be at least {forced}, the cost of forced_in, got {budget}")
@@ -169,7 +169,7 @@ class DominationProblem:
         Raises:
             ValueError: `chosen` has a node that is not in the graph.
         """
-        chosen = parts.canonical_nodes("chosen", chosen, self.num_nodes)
+        chosen = validation.canonical_nodes("chosen", chosen, self.num_nodes)
         members = set(chosen)
         if not members.issuperset(self.forced_in) or not members.isdisjoint(self.forced_out):
             return False
@@ -184,7 +184,7 @@ class DominationProblem:
         return matrix @ indicator >= needs
 
     def _nodes(self, chosen: Iterable[int]) -> Ids:
-        return np.array(parts.canonical_nodes("chosen", chosen, self.num_nodes), dtype=np.int64)
+        return np.array(validation.canonical_nodes("chosen", chosen, self.num_nodes), dtype=np.int64)
 
 
 def dominates(adjacency: Adjacency, chosen: Iterable[int]) -> bool:
@@ -209,7 +209,7 @@ def dominates(adjacency: Adjacency, chosen: Iterable[int]) -> bool:
         [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set.
     """
     problem = DominationProblem(adjacency)
-    nodes = list(parts.canonical_nodes("chosen", chosen, problem.num_nodes))
+    nodes = list(validation.canonical_nodes("chosen", chosen, problem.num_nodes))
     dominated = np.zeros(problem.num_nodes, dtype=bool)
     dominated[problem.adjacency[nodes].indices] = True
     return bool(dominated.all())

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 from slimsfm.domination.cover import Cover, components, cover_of, split
 from slimsfm.domination.greedy import LARGE, greedy, greedy_parts, part_bound
-from slimsfm.domination.kernel import reduced
+from slimsfm.domination.presolve import reduced
 from slimsfm.domination.problem import DominationProblem
 from slimsfm.domination.program import Minimizer, Minimum, Program, covering_program
 from slimsfm.domination.solution import Bounds, Solution, merit, rounded_up, solution_of

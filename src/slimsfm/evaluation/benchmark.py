@@ -14,7 +14,7 @@ from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Trial, 
 from slimsfm.evaluation.variants import Making, Variant, parse_variant
 from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.graph.source import Edges
 from slimsfm.localization import LocalizationOptions
 from slimsfm.mapping.build import BuildOptions
@@ -139,7 +139,7 @@ def _making(subject: _Subject) -> Making:
     options, progress = subject.bench.options, subject.bench.progress
     full = _full_map(subject)
     edges = graph_options(options, subject.method)
-    graph = graph_of(full, subject.map_path("full"), edges, progress=progress).graph
+    graph = load_or_compute_graph(full, subject.map_path("full"), edges, progress=progress).graph
     return Making(
         map=full,
         graph=graph,

@@ -27,8 +27,8 @@ from slimsfm.reduction import (
     recommend,
 )
 from slimsfm.selection import SELECTORS
-from slimsfm.selection.left_out import LeftOut
-from slimsfm.selection.views import selection_problem
+from slimsfm.selection.leave_one_out import LeftOut
+from slimsfm.selection.usable_points import selection_problem
 
 _DRAWS = 5
 _SELECTOR = "information"

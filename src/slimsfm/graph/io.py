@@ -23,7 +23,7 @@ from slimsfm.progress import ProgressBar, silent
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error)
 
 
-def graph_of(
+def load_or_compute_graph(
     map: Map,
     folder: Path,
     options: GraphOptions = GraphOptions(),

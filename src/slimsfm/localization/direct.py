@@ -12,8 +12,8 @@ import pycolmap
 from jaxtyping import Int64
 
 from slimsfm.features import nearest_for
-from slimsfm.localization.describing import describe_points
 from slimsfm.localization.matching import match_target
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
 from slimsfm.mapping.map import Map
 
@@ -36,7 +36,7 @@ class Direct:
         for count in (*counts, len(query.descriptors)):
             yield unite([match_target(query.descriptors[:count], self._target, self._nearest)])
 
-    def expected(
+    def visible_points(
         self,
         cam_from_world: pycolmap.Rigid3d,
         agreeing: Int64[np.ndarray, " _"] | None = None,  # noqa: ARG002

@@ -19,8 +19,8 @@ class Exhaustive:
         """Match the query with every reference image, in one round."""
         yield self._references.match(query)
 
-    def expected(
+    def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """What a reference image near the pose sees."""
-        return self._references.expected(cam_from_world, agreeing)
+        return self._references.visible_points(cam_from_world, agreeing)

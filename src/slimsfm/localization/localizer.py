@@ -14,9 +14,9 @@ from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.features.methods import DETECTOR_FREE, importing, plugins, resolve
 from slimsfm.gravity import Gravity
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
-from slimsfm.localization.guided import extract_near
-from slimsfm.localization.search import Attempt, Found, Search
-from slimsfm.localization.strategy import Cropping, MatchingOptions, Query, Strategy
+from slimsfm.localization.guided_matching import extract_near
+from slimsfm.localization.search import RoundResult, Search, SearchResult
+from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions
 
@@ -192,7 +192,7 @@ class Localizer:
     @property
     def looks_at_images(self) -> bool:
         """Whether features alone are not enough: the strategy looks at queries itself."""
-        return isinstance(self._strategy, Cropping) or self.map.info.extractor in DETECTOR_FREE
+        return isinstance(self._strategy, PoseGuided) or self.map.info.extractor in DETECTOR_FREE
 
     def localize_features(
         self,
@@ -205,11 +205,11 @@ class Localizer:
         query = self._query(features, camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), 0.0)
 
-    def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[Attempt]:
+    def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[RoundResult]:
         """Everything that the strategy would try, round by round, without an early stop."""
         return self._search.attempts(self._query(features, camera), camera)
 
-    def _localization(self, query: Query, found: Found, extract_seconds: float) -> Localization:
+    def _localization(self, query: Query, found: SearchResult, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
         if found.best.confidence < self._options.min_confidence:
             pose = evidence = None

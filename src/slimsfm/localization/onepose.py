@@ -78,11 +78,11 @@ class OnePose:
         """Look where a pose puts the box; at all features where it puts it out of sight."""
         return self._look(query, region_of_box(self._box, near_cam_from_world, query.camera)).matches()
 
-    def expected(
+    def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """The points that were seen from about where the camera stands."""
-        return self._direct.expected(cam_from_world, agreeing)
+        return self._direct.visible_points(cam_from_world, agreeing)
 
     def _look(self, query: Query, region: Region | None) -> Look:
         """Find points in a part of a query, or in the whole."""

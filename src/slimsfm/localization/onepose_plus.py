@@ -94,7 +94,7 @@ class OnePosePlus:
             return PointMatches.none()
         return self._look(query.image, region).matches()
 
-    def expected(
+    def visible_points(
         self,
         cam_from_world: pycolmap.Rigid3d,  # noqa: ARG002
         agreeing: Int64[np.ndarray, " _"] | None = None,  # noqa: ARG002

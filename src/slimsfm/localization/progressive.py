@@ -11,9 +11,9 @@ from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import Ids
 from slimsfm.features import nearest_for
-from slimsfm.localization.describing import describe_points
 from slimsfm.localization.landmarks import choose_landmarks
 from slimsfm.localization.matching import match_target
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.ranking import Ranking
 from slimsfm.localization.references import References
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
@@ -59,8 +59,8 @@ class Progressive:
         score[tried] = -np.inf
         return int(score.argmax())
 
-    def expected(
+    def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """What a reference image near the pose sees."""
-        return self._references.expected(cam_from_world, agreeing)
+        return self._references.visible_points(cam_from_world, agreeing)

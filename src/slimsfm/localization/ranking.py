@@ -5,7 +5,7 @@ from jaxtyping import Float32
 
 from slimsfm.arrays import Descriptors
 from slimsfm.features.vlad import vlad
-from slimsfm.mapping.appearance import describe_images
+from slimsfm.mapping.global_descriptors import describe_images
 from slimsfm.mapping.map import Map
 
 _STRONGEST = 2048  # keypoints that tell what a query looks like
@@ -15,7 +15,7 @@ class Ranking:
     """Compares a query with all reference images at once, by global descriptors."""
 
     def __init__(self, map: Map) -> None:
-        self._appearance = map.appearance or describe_images(map)
+        self._global_descriptors = map.global_descriptors or describe_images(map)
 
     def similarities(self, descriptors: Descriptors) -> Float32[np.ndarray, " references"]:
         """Cosine between a query's global descriptor and that of each reference image, in order of name.
@@ -23,4 +23,6 @@ class Ranking:
         Args:
             descriptors: What the query looks like, the strongest keypoints first.
         """
-        return self._appearance.rows @ vlad(descriptors[:_STRONGEST], self._appearance.words)
+        return self._global_descriptors.descriptors @ vlad(
+            descriptors[:_STRONGEST], self._global_descriptors.vocabulary
+        )

@@ -57,7 +57,7 @@ class References:
         """How many of some points each image sees."""
         return np.asarray(self._seen_by[points].sum(axis=0), np.float32)
 
-    def expected(
+    def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """What one image sees, for a camera near it should see it too.

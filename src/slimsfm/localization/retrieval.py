@@ -28,8 +28,8 @@ class Retrieval:
         order = np.argsort(-self._ranking.similarities(self._references.describe(query)), kind="stable")
         yield self._references.match(query, order[: self._retrieved].tolist())
 
-    def expected(
+    def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """What a reference image near the pose sees."""
-        return self._references.expected(cam_from_world, agreeing)
+        return self._references.visible_points(cam_from_world, agreeing)

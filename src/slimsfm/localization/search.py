@@ -12,9 +12,9 @@ from slimsfm.focal import estimate_pose_and_focal
 from slimsfm.geometry import project
 from slimsfm.gravity import Gravity, estimate_upright_pose
 from slimsfm.localization.cameras import FocalLength
-from slimsfm.localization.describing import describe_points
-from slimsfm.localization.guided import match_near
-from slimsfm.localization.strategy import Cropping, PointMatches, Query, Strategy
+from slimsfm.localization.guided_matching import match_near
+from slimsfm.localization.point_descriptors import describe_points
+from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -27,7 +27,7 @@ _SETTLED = 0.8  # of the error of the round before: more matches no longer help 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Attempt:
+class RoundResult:
     """What one round gave."""
 
     matches: PointMatches
@@ -55,10 +55,10 @@ class Attempt:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Found:
+class SearchResult:
     """The attempt that counts, and what all of them took."""
 
-    best: Attempt
+    best: RoundResult
     """The last that gave a pose: it knows all that those before knew, and what speaks against them."""
 
     references: int
@@ -83,29 +83,31 @@ class Search:
         self._focal: FocalLength = focal
         self._verifier = Verifier(map, strategy, map.point_descriptors or describe_points(map))
 
-    def run(self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None) -> Found:
+    def run(self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None) -> SearchResult:
         """Localize a query: try until it is enough."""
-        attempts: list[Attempt] = []
+        attempts: list[RoundResult] = []
         for attempt in self.attempts(query, camera, gravity):
             attempts.append(attempt)
             if _is_enough(attempts):
                 break
         return _summed(attempts)
 
-    def near(self, query: Query, camera: pycolmap.Camera, near_cam_from_world: pycolmap.Rigid3d) -> Found:
+    def near(
+        self, query: Query, camera: pycolmap.Camera, near_cam_from_world: pycolmap.Rigid3d
+    ) -> SearchResult:
         """Localize a query that was taken about from there: points are sought near where they project."""
         start = perf_counter()
-        if isinstance(self._strategy, Cropping):
+        if isinstance(self._strategy, PoseGuided):
             matches = self._strategy.near(query, near_cam_from_world)
         else:
-            target = self._strategy.expected(near_cam_from_world)
+            target = self._strategy.visible_points(near_cam_from_world)
             pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
             matches = match_near(query, target, pixels, camera, nearest_for(self._map.info.extractor))
         return _summed([self._attempt(query, matches, camera, start)])
 
     def attempts(
         self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None
-    ) -> Iterator[Attempt]:
+    ) -> Iterator[RoundResult]:
         """Try everything, round by round."""
         rounds, pose = self._strategy.rounds(query), None
         while True:
@@ -125,14 +127,14 @@ class Search:
         camera: pycolmap.Camera,
         start: float,
         gravity: Gravity | None = None,
-    ) -> Attempt:
+    ) -> RoundResult:
         matched = perf_counter()
         posed = self._estimate(query, matches, camera, gravity)
         pose, evidence = posed.pose, None
         if pose is not None:
             evidence = self._verifier.evidence(query, matches, pose, posed.camera)
             pose = replace(pose, confidence=evidence.confidence)
-        return Attempt(
+        return RoundResult(
             matches=matches,
             pose=pose,
             camera=posed.camera,
@@ -161,7 +163,7 @@ class _Posed(NamedTuple):
     camera: pycolmap.Camera
 
 
-def _is_enough(attempts: list[Attempt]) -> bool:
+def _is_enough(attempts: list[RoundResult]) -> bool:
     """Whether the last pose is sure, and exact or no longer becoming much more so."""
     last = attempts[-1].evidence
     if last is None or last.confidence < _SURE:
@@ -173,8 +175,8 @@ def _is_enough(attempts: list[Attempt]) -> bool:
     return settled or last.predicted_error <= _EXACT
 
 
-def _summed(attempts: list[Attempt]) -> Found:
-    return Found(
+def _summed(attempts: list[RoundResult]) -> SearchResult:
+    return SearchResult(
         best=next((one for one in reversed(attempts) if one.pose), attempts[-1]),
         references=max(one.matches.references for one in attempts),
         match_seconds=sum(one.match_seconds for one in attempts),

@@ -101,7 +101,7 @@ class Strategy(Protocol):
         """
         ...
 
-    def expected(
+    def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """What a camera should see that stands there, as far as nothing hides it.
@@ -114,7 +114,7 @@ class Strategy(Protocol):
 
 
 @runtime_checkable
-class Cropping(Protocol):
+class PoseGuided(Protocol):
     """A strategy that looks at a part of the image of its own, where the pose says that the object is."""
 
     def near(self, query: Query, near_cam_from_world: pycolmap.Rigid3d) -> PointMatches:

@@ -141,7 +141,7 @@ class Verifier:
 
     def _found(self, query: Query, agreeing: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> float:
         """Which share of what should be visible is found, and found nowhere else."""
-        descriptors, points = self._strategy.expected(pose.cam_from_world, agreeing)
+        descriptors, points = self._strategy.visible_points(pose.cam_from_world, agreeing)
         pixels = project(self._points3D_in_world[points], pose.cam_from_world, camera)
         inside = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=1)
         visible = np.flatnonzero(inside)

@@ -1,7 +1,7 @@
 """Maps: what they are, how they are read, written, built, imported and cut down to some images."""
 
 from slimsfm.mapping.build import Build, BuildOptions, KnownPoses, build_map
-from slimsfm.mapping.importing import ImportOptions, import_model
+from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map, MapInfo, Observations
 from slimsfm.mapping.subset import keep_images
@@ -15,7 +15,7 @@ __all__ = [
     "MapInfo",
     "Observations",
     "build_map",
-    "import_model",
+    "import_colmap",
     "keep_images",
     "read_map",
     "write_map",

@@ -13,12 +13,12 @@ from slimsfm.features.image_matching import Photo, load_image_matcher
 from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
-from slimsfm.mapping.appearance import with_appearance
 from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.build_keypoint_free import PhotoFolder, build_without_keypoints
 from slimsfm.mapping.cameras import CameraSharing, guess_cameras
 from slimsfm.mapping.cell_keypoints import Matches
 from slimsfm.mapping.extraction import color_points, extract_features
+from slimsfm.mapping.global_descriptors import with_global_descriptors
 from slimsfm.mapping.image_pairs import choose_image_pairs
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.pair_matching import match_pairs_with, verify_pairs
@@ -145,7 +145,7 @@ def build_map(
     made = Map(
         model=parts.model, features=parts.features, matches=parts.matches, photos=parts.photos, info=info
     )
-    return _build(with_appearance(made), names)
+    return _build(with_global_descriptors(made), names)
 
 
 def _build(map: Map, names: list[str]) -> Build:

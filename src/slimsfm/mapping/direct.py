@@ -20,7 +20,13 @@ def direct_map(map: Map, chosen: PointDescriptors) -> Map:
     points = np.arange(len(chosen.points), dtype=np.int64)
     descriptors = replace(chosen, points=points)
     return replace(
-        map, model=model, features={}, matches={}, photos={}, appearance=None, point_descriptors=descriptors
+        map,
+        model=model,
+        features={},
+        matches={},
+        photos={},
+        global_descriptors=None,
+        point_descriptors=descriptors,
     )
 
 

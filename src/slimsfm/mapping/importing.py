@@ -12,8 +12,8 @@ from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
-from slimsfm.mapping.appearance import with_appearance
 from slimsfm.mapping.box import estimate_box, read_box
+from slimsfm.mapping.global_descriptors import with_global_descriptors
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, read_model
 from slimsfm.mapping.redescribe import redescribe
@@ -65,7 +65,7 @@ class _Source:
     origin: str
 
 
-def import_model(
+def import_colmap(
     model_path: Path, options: ImportOptions = ImportOptions(), progress: ProgressBar = silent
 ) -> Map:
     """Make a map of a COLMAP model, binary or text, with or without rigs and frames.
@@ -90,7 +90,7 @@ def import_model(
         origin=f"imported COLMAP model with descriptors from {source.origin}",
     )
     made = Map(model=model, features=source.features, matches=source.matches, info=info)
-    return with_appearance(made)
+    return with_global_descriptors(made)
 
 
 def _find_source(

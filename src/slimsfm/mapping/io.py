@@ -21,7 +21,7 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
-from slimsfm.mapping.appearance import read_appearance, write_appearance
+from slimsfm.mapping.global_descriptors import read_global_descriptors, write_global_descriptors
 from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
 from slimsfm.mapping.photo_file import PhotoFile, write_photos
@@ -43,7 +43,9 @@ def read_map(path: Path) -> Map:
         points = path / "points.npz"
         direct = read_point_descriptors(points, model.num_points3D()) if points.exists() else None
         names = sorted(model.image(i).name for i in model.reg_image_ids())
-        matches, appearance, photos = (path / part for part in ("matches.h5", "global.npz", "photos.h5"))
+        matches, global_descriptors, photos = (
+            path / part for part in ("matches.h5", "global.npz", "photos.h5")
+        )
         features = (
             None if direct and not (path / "features.h5").exists() else FeatureFile(path / "features.h5")
         )
@@ -52,7 +54,9 @@ def read_map(path: Path) -> Map:
             features={} if features is None else features,
             matches=MatchFile(matches, names) if matches.exists() else {},
             point_descriptors=direct,
-            appearance=read_appearance(appearance, len(names)) if appearance.exists() else None,
+            global_descriptors=read_global_descriptors(global_descriptors, len(names))
+            if global_descriptors.exists()
+            else None,
             photos=PhotoFile(photos) if photos.exists() else {},
             info=info,
         )
@@ -83,8 +87,8 @@ def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
             write_matches(partial / "matches.h5", map.matches, counts)
         if map.photos:
             write_photos(partial / "photos.h5", map.photos)
-        if map.appearance:
-            write_appearance(partial / "global.npz", map.appearance)
+        if map.global_descriptors:
+            write_global_descriptors(partial / "global.npz", map.global_descriptors)
         if map.point_descriptors:
             write_point_descriptors(partial / "points.npz", map.point_descriptors)
         (partial / "map.json").write_text(json.dumps(_info_to_json(map.info), indent=2) + "\n")

@@ -79,13 +79,13 @@ class PointDescriptors:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Appearance:
+class GlobalDescriptors:
     """What the reference images look like as a whole."""
 
-    words: Float32[np.ndarray, "words d"]
+    vocabulary: Float32[np.ndarray, "words d"]
     """The words that global descriptors are made by, see `features.vlad`."""
 
-    rows: Float32[np.ndarray, "images values"]
+    descriptors: Float32[np.ndarray, "images values"]
     """For each reference image, in order of name, its global descriptor, of unit length."""
 
 
@@ -109,7 +109,7 @@ class Map:
     photos: Mapping[str, Image] = field(default_factory=dict)
     """The reference photos by image name, small; just in maps built without a detector."""
 
-    appearance: Appearance | None = None
+    global_descriptors: GlobalDescriptors | None = None
     """By what reference images that resemble a query are found; None where it has to be made anew."""
 
     info: MapInfo

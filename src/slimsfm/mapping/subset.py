@@ -9,7 +9,7 @@ import pycolmap
 from slimsfm.arrays import Image, IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features import Features
-from slimsfm.mapping.map import Appearance, Map, check_has_features
+from slimsfm.mapping.map import GlobalDescriptors, Map, check_has_features
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -45,16 +45,18 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
         features=features,
         matches=matches,
         photos=photos,
-        appearance=_appearance_of(map, chosen),
+        global_descriptors=_global_descriptors_of(map, chosen),
         point_descriptors=None,
     )
 
 
-def _appearance_of(map: Map, chosen: frozenset[str]) -> Appearance | None:
-    if map.appearance is None:
+def _global_descriptors_of(map: Map, chosen: frozenset[str]) -> GlobalDescriptors | None:
+    if map.global_descriptors is None:
         return None
     rows = [row for row, name in enumerate(map.images) if name in chosen]
-    return Appearance(words=map.appearance.words, rows=map.appearance.rows[rows])
+    return GlobalDescriptors(
+        vocabulary=map.global_descriptors.vocabulary, descriptors=map.global_descriptors.descriptors[rows]
+    )
 
 
 class Selection(Mapping[Key, Value]):

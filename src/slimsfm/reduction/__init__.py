@@ -1,6 +1,7 @@
 """From a map to a slim one, and what that costs, told beforehand."""
 
 from slimsfm.reduction.choice import Candidate, Choice, Maker, points_seen
+from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.frontier import USES, Frontier, FrontierOptions, Weigh, frontier, try_images
 from slimsfm.reduction.images import (
     Reduction,
@@ -12,7 +13,6 @@ from slimsfm.reduction.images import (
     reduce_map,
 )
 from slimsfm.reduction.recommend import Wish, recommend
-from slimsfm.reduction.trial import Prediction, Trials
 
 __all__ = [
     "USES",

@@ -7,11 +7,11 @@ import numpy as np
 
 from slimsfm.arrays import Ids
 from slimsfm.geometry import ADD_FRACTIONS
-from slimsfm.localization.describing import describe_points
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import Map, PointDescriptors
 from slimsfm.mapping.subset import keep_images
-from slimsfm.reduction.trial import Prediction
+from slimsfm.reduction.forecast import Prediction
 
 DOMINATING = "dominating"
 """The method that keeps a dominating set of the images."""

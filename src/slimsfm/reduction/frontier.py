@@ -12,12 +12,12 @@ from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction.choice import DOMINATING, Candidate, Choice, Maker, points_seen
+from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.images import ReductionOptions, dominating_set
-from slimsfm.reduction.trial import Prediction, Trials
 from slimsfm.selection import SELECTORS
-from slimsfm.selection.left_out import LeftOut
+from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem
-from slimsfm.selection.views import selection_problem
+from slimsfm.selection.usable_points import selection_problem
 
 Weigh = Callable[[Map], int]
 """Tells how many bytes a map takes on disk."""

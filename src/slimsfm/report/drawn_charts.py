@@ -15,8 +15,8 @@ from slimsfm.report.charts import (
     sphere_chart,
 )
 from slimsfm.report.figures import figure_svg
-from slimsfm.report.opened import OpenedObject
-from slimsfm.report.story import Story
+from slimsfm.report.report_data import Story
+from slimsfm.report.run_maps import OpenedObject
 
 _CSS_PX = 96  # to an inch
 

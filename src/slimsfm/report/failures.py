@@ -11,9 +11,9 @@ from slimsfm.evaluation.metrics import SURE
 from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.evaluation.results import ObjectResult
 from slimsfm.geometry import ADD_FRACTIONS
-from slimsfm.report.story import Story
+from slimsfm.report.formatting import difference, line_name, percent_of_d, plural
+from slimsfm.report.report_data import Story
 from slimsfm.report.table import NOTHING, Head, Value, table_html
-from slimsfm.report.words import difference, line_name, percent_of_d, plural
 
 _MOST = 200  # listed
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from slimsfm.graph import ReferenceGraph
+from slimsfm.report.formatting import percent_of_d, plural
 from slimsfm.report.graph_layout import graph_layout, node_side
 from slimsfm.report.jpegs import photo_uri
-from slimsfm.report.words import percent_of_d, plural
 
 _WIDTH, _HEIGHT = 1000.0, 750.0  # of the drawing: nodes get the shape of most photos
 _GAP = 0.92  # a photo's side over its node's

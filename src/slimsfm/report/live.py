@@ -21,8 +21,8 @@ from slimsfm.geometry import corner_error
 from slimsfm.mapping.map import Map
 from slimsfm.photos import read_image, shrink
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.report.formatting import contents, number, size
 from slimsfm.report.live_stage import BOX_RGB, DROPPED_RGB, KEPT_RGB, Stage
-from slimsfm.report.words import contents, number, size
 
 MAX_PHOTO_PX = 320
 """Longer side of a photo in a frustum; larger ones are scaled down."""

@@ -7,13 +7,13 @@ from html import escape
 from slimsfm.mapping.map import Map
 from slimsfm.report.budget import Budget, budget_for
 from slimsfm.report.drawn_charts import object_charts
+from slimsfm.report.formatting import contents, domination, gain, line_name
 from slimsfm.report.graph_view import GraphView, graph_html
-from slimsfm.report.opened import OpenedObject, open_object
 from slimsfm.report.queries import queries_html
+from slimsfm.report.report_data import Story
+from slimsfm.report.run_maps import OpenedObject, open_object
 from slimsfm.report.scene3d import scene
-from slimsfm.report.story import Story
 from slimsfm.report.table import rows_html
-from slimsfm.report.words import contents, domination, gain, line_name
 
 
 def objects_html(story: Story, anchors: Mapping[str, str]) -> str:

@@ -10,9 +10,9 @@ from slimsfm.evaluation.summary import summarize_domination
 from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row
 from slimsfm.report.drawn_charts import average_charts
 from slimsfm.report.failures import failures_html
-from slimsfm.report.story import Story
+from slimsfm.report.formatting import difference, gain, line_name, number, plural, ratio, size
+from slimsfm.report.report_data import Story
 from slimsfm.report.table import NOTHING, Head, Value, rows_html, table_html
-from slimsfm.report.words import difference, gain, line_name, number, plural, ratio, size
 
 
 def overview_html(story: Story, anchors: Mapping[str, str]) -> str:

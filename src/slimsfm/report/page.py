@@ -35,7 +35,7 @@ def report_html(run: Run) -> str:
     # these import matplotlib and networkx, for which whoever writes no page is not to wait
     from slimsfm.report.object_section import objects_html
     from slimsfm.report.overview import overview_html
-    from slimsfm.report.story import story_of
+    from slimsfm.report.report_data import story_of
 
     story = story_of(run)
     anchors = {one.name: f"object-{number}" for number, one in enumerate(run.objects, start=1)}

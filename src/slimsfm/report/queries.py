@@ -11,8 +11,8 @@ from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.evaluation.results import ObjectResult
 from slimsfm.photos import read_image
 from slimsfm.report.budget import Budget
+from slimsfm.report.formatting import line_name, percent_of_d
 from slimsfm.report.frames import QueryFrame, frame_html
-from slimsfm.report.words import line_name, percent_of_d
 
 
 def worth_seeing(errors: Float64[np.ndarray, " n"], count: int) -> list[int]:

@@ -16,7 +16,7 @@ from jaxtyping import Float32, Float64, Int64, Real, UInt8
 
 from slimsfm.arrays import GrayImage, Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import project
-from slimsfm.tracking.view import View
+from slimsfm.tracking.gray_frame import View
 
 _SIDE_PX = 33  # of a template: holds a window turned and shrunk
 _WINDOW_PX = 13  # of what is compared

@@ -15,10 +15,10 @@ from slimsfm.arrays import Points2D
 from slimsfm.geometry import Box, project
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.tracking.flow import follow_points
+from slimsfm.tracking.gray_frame import View
 from slimsfm.tracking.motion import foretold
 from slimsfm.tracking.refine import refine_pose
 from slimsfm.tracking.templates import Sighting, Templates, find
-from slimsfm.tracking.view import View
 
 MAX_CORNER_ERROR = 0.03
 """Largest corner error, over the diagonal, to expect of a pose that is believed: points on a small spot, such

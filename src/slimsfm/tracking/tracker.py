@@ -12,12 +12,12 @@ from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking.ambiguity import is_ambiguous
+from slimsfm.tracking.background import Renewal, Renewed
+from slimsfm.tracking.gray_frame import View, view_of
 from slimsfm.tracking.motion import smoothed
-from slimsfm.tracking.recovery import Recovery
-from slimsfm.tracking.renewal import Renewal, Renewed
+from slimsfm.tracking.relocalization import Recovery
 from slimsfm.tracking.templates import Templates, cut_out, joined, spread
 from slimsfm.tracking.track import Track, begun, follow
-from slimsfm.tracking.view import View, view_of
 
 State = Literal["tracked", "localized", "lost"]
 

@@ -13,8 +13,8 @@ from slimsfm.arrays import Points2D, Points3D
 from slimsfm.geometry import BOX_EDGES
 from slimsfm.mapping.map import Map
 from slimsfm.report.figures import CHOSEN, DROPPED, new_figure, styled
+from slimsfm.report.formatting import contents
 from slimsfm.report.scene3d import Frame, view_frame
-from slimsfm.report.words import contents
 
 MAX_POINTS = 20_000
 """Points shown of a map: every so-manyth by id of more."""

@@ -9,7 +9,7 @@ from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.report.charts.calibration import BINS, Calibration, calibration
 from slimsfm.report.figures import COLORS, INK, new_figure, styled
-from slimsfm.report.words import plural
+from slimsfm.report.formatting import plural
 
 
 def reliability_chart(outcomes: Outcomes) -> Figure:

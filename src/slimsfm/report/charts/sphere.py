@@ -19,7 +19,7 @@ from slimsfm.report.charts.directions import (
     from_angles,
 )
 from slimsfm.report.figures import CHOSEN, DROPPED, INK, new_figure, styled
-from slimsfm.report.words import plural
+from slimsfm.report.formatting import plural
 
 _RIGHT = "#12873a"
 _LOOKS: dict[Verdict, dict] = {

@@ -25,7 +25,7 @@ from slimsfm.mapping.map import Map, observed
 from slimsfm.mapping.point_file import quantize
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.selection.left_out import LeftOut
+from slimsfm.selection.leave_one_out import LeftOut
 
 _MOST_TESTS = 60
 _LOST = 0.5  # of the right matches of a test, at most

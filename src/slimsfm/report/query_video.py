@@ -12,8 +12,8 @@ from slimsfm.arrays import Image
 from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.evaluation.results import ObjectResult
 from slimsfm.files import replacing
+from slimsfm.report.formatting import percent_of_d
 from slimsfm.report.frames import QueryFrame, draw_frame
-from slimsfm.report.words import percent_of_d
 
 MAX_SIZE = 720
 """Longer side of a query image; larger ones are scaled down."""

@@ -7,7 +7,7 @@ from slimsfm.evaluation.methods import parse_method
 from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.evaluation.variants import parse_variant
 from slimsfm.graph import ReferenceGraph
-from slimsfm.graph.io import graph_of
+from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
 from slimsfm.reduction import ReductionOptions
@@ -51,6 +51,6 @@ def open_object(run: Run, result: ObjectResult, method: str) -> OpenedObject:
         result=result,
         mapped=next(one for one in result.maps if one.method == method),
         maps=maps,
-        graph=graph_of(maps["full"], run.map_path(result.name, method, "full"), options).graph,
+        graph=load_or_compute_graph(maps["full"], run.map_path(result.name, method, "full"), options).graph,
         threshold=threshold,
     )

@@ -13,8 +13,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.localization import Localization
+from slimsfm.tracking.gray_frame import View
 from slimsfm.tracking.track import Track
-from slimsfm.tracking.view import View
 
 _FEW = 0.8  # of the most points seen since the last renewal
 _TURNED_DEG = 12.0  # the direction from the object to the camera, since then

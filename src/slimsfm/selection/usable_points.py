@@ -15,7 +15,7 @@ from slimsfm.features import match_nearest
 from slimsfm.geometry import motions, reprojection_errors
 from slimsfm.mapping.map import Map, observed
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.selection.left_out import LeftOut
+from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem, Twists
 
 _MAX_ERROR_PX = 4.0  # of a right match

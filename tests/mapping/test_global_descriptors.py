@@ -5,9 +5,9 @@ import pytest
 
 from scenes import exact_map
 from slimsfm.errors import MapError
-from slimsfm.localization.describing import describe_points
-from slimsfm.mapping.appearance import describe_images, with_appearance
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.direct import direct_map
+from slimsfm.mapping.global_descriptors import describe_images, with_global_descriptors
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.subset import keep_images
 
@@ -15,11 +15,11 @@ from slimsfm.mapping.subset import keep_images
 @pytest.fixture(scope="module")
 def narrow():
     """Twelve images, each of which sees a part of the points."""
-    return with_appearance(exact_map(num_images=12, num_points=400, reach_deg=60.0))
+    return with_global_descriptors(exact_map(num_images=12, num_points=400, reach_deg=60.0))
 
 
 def test_an_image_resembles_itself_most_and_its_neighbours_more_than_others(narrow):
-    cosines = narrow.appearance.rows @ narrow.appearance.rows.T
+    cosines = narrow.global_descriptors.descriptors @ narrow.global_descriptors.descriptors.T
     assert np.allclose(np.diag(cosines), 1, atol=1e-4)
     opposite = np.roll(cosines, 6, axis=1).diagonal()
     assert np.all(np.roll(cosines, 1, axis=1).diagonal() > opposite)
@@ -31,14 +31,16 @@ def test_what_sees_no_point_of_the_map_does_not_count(narrow):
         seen = np.zeros(len(one), bool)
         seen[narrow.observations[name].rows] = True
         features[name] = replace(one, descriptors=np.where(seen[:, None], one.descriptors, 0.5))
-    assert np.array_equal(describe_images(replace(narrow, features=features)).rows, narrow.appearance.rows)
+    assert np.array_equal(
+        describe_images(replace(narrow, features=features)).descriptors, narrow.global_descriptors.descriptors
+    )
 
 
 def test_it_is_read_back_but_for_rounding(narrow, tmp_path):
     write_map(narrow, tmp_path / "map")
-    read = read_map(tmp_path / "map").appearance
-    assert np.array_equal(read.words, narrow.appearance.words)
-    assert np.all(np.sum(read.rows * narrow.appearance.rows, axis=1) > 0.94)
+    read = read_map(tmp_path / "map").global_descriptors
+    assert np.array_equal(read.vocabulary, narrow.global_descriptors.vocabulary)
+    assert np.all(np.sum(read.descriptors * narrow.global_descriptors.descriptors, axis=1) > 0.94)
     assert bytes_by_part(tmp_path / "map")["global.npz"] > 0
 
 
@@ -46,14 +48,14 @@ def test_it_stays_with_the_images_that_stay(narrow):
     names = list(narrow.images)[2:9:3]
     slim = keep_images(narrow, names)
     rows = [list(narrow.images).index(name) for name in names]
-    assert np.array_equal(slim.appearance.rows, narrow.appearance.rows[rows])
-    assert direct_map(narrow, describe_points(narrow)).appearance is None
+    assert np.array_equal(slim.global_descriptors.descriptors, narrow.global_descriptors.descriptors[rows])
+    assert direct_map(narrow, describe_points(narrow)).global_descriptors is None
 
 
 def test_a_map_without_it_is_read(narrow, tmp_path):
-    write_map(replace(narrow, appearance=None), tmp_path / "map")
+    write_map(replace(narrow, global_descriptors=None), tmp_path / "map")
     assert not (tmp_path / "map" / "global.npz").exists()
-    assert read_map(tmp_path / "map").appearance is None
+    assert read_map(tmp_path / "map").global_descriptors is None
 
 
 def test_a_damaged_or_foreign_file_is_named(narrow, tmp_path):

@@ -56,7 +56,7 @@ def _distinct(map: Map, descriptors: Descriptors) -> Mask:
     if not len(points):
         return np.zeros(0, dtype=bool)
     alike_at = np.cos(_ALIKE * nearest_for(map.info.extractor).max_distance)
-    words = map.appearance.words if map.appearance else learn_words(descriptors)
+    words = map.global_descriptors.vocabulary if map.global_descriptors else learn_words(descriptors)
     word_of = nearest_word(descriptors, words)
     distinct = np.ones(len(points), dtype=bool)
     for word in range(len(words)):

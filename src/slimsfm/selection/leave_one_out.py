@@ -8,7 +8,7 @@ from jaxtyping import Float32
 
 from slimsfm.arrays import Descriptors, Ids, Points2D
 from slimsfm.features import unit_rows
-from slimsfm.localization.describing import descriptor_sums
+from slimsfm.localization.point_descriptors import descriptor_sums
 from slimsfm.mapping.map import Map
 
 _CACHED = 64  # images whose descriptors are kept at hand
