@@ -2,18 +2,16 @@
 
     python benchmarks/readme_animation.py -o docs/images/tracked.webp --scenes SCENES
 
-Everything is rendered, so the picture can be made again anywhere. SCENES keeps the object, its map and the small map.
+Everything is rendered, so anyone can make the picture again. SCENES keeps the object and its two maps.
 """
 
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 from benchmark_scenes import rendered
 from PIL import Image as PilImage
-from tracking import slim_map
+from PIL import ImageDraw, ImageFont
 
 from slimsfm.arrays import Image
 from slimsfm.files import replacing
@@ -22,8 +20,9 @@ from slimsfm.mapping import read_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.report.frames import draw_box
-from slimsfm.synthetic.film import FRAMES_PER_SECOND, film
+from slimsfm.synthetic.film import FRAMES_PER_SECOND, Film, film
 from slimsfm.tracking import Tracked, Tracker
+from tracking import slim_map
 
 NAME, FRAMES, FIRST, LAST = "printed_box", 600, 20, 200
 STEP = 2  # frames between two that are shown; all are tracked
@@ -37,7 +36,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", required=True, type=Path, help="the picture, a .webp file")
     parser.add_argument("--scenes", required=True, type=Path, help="folder for the object and its maps")
     arguments = parser.parse_args()
-    pictures = [PilImage.fromarray(one) for one in frames(arguments.scenes)]
+    pictures = list(frames(arguments.scenes))
     with replacing(arguments.output, overwrite=True) as partial, partial.open("wb") as file:
         milliseconds = round(1000 * STEP / FRAMES_PER_SECOND)
         options = {"quality": 55, "method": 6, "duration": milliseconds, "loop": 0}
@@ -45,7 +44,7 @@ def main() -> None:
     print(f"{arguments.output}: {len(pictures)} frames, {arguments.output.stat().st_size / 1e6:.2f} MB")
 
 
-def frames(scenes: Path) -> Iterator[Image]:
+def frames(scenes: Path) -> Iterator[PilImage.Image]:
     """The frames to show, each with its box and a caption."""
     if not (scenes / f"{NAME}-map").exists():
         rendered(NAME, scenes)
@@ -60,16 +59,15 @@ def frames(scenes: Path) -> Iterator[Image]:
             yield drawn(image, tracked, made, caption)
 
 
-def drawn(image: Image, tracked: Tracked, made, caption: str) -> Image:
+def drawn(image: Image, tracked: Tracked, made: Film, caption: str) -> PilImage.Image:
     """The frame, shrunk, with the box under the estimated pose and the size of the map."""
     image = image.copy()
     if tracked.pose:
-        draw_box(image, made.box, tracked.pose.cam_from_world, made.camera, BOX_RGB, 3)
+        draw_box(image, made.box, tracked.pose.cam_from_world, made.camera, BOX_RGB, thickness=3)
     height = round(WIDTH * image.shape[0] / image.shape[1])
-    small = np.ascontiguousarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA))
-    place, font = (12, height - 14), cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(small, caption, place, font, 0.55, (0, 0, 0), 4, cv2.LINE_AA)
-    cv2.putText(small, caption, place, font, 0.55, INK_RGB, 1, cv2.LINE_AA)
+    small = PilImage.fromarray(image).resize((WIDTH, height), PilImage.Resampling.LANCZOS)
+    font = ImageFont.load_default(size=18)
+    ImageDraw.Draw(small).text((12, height - 30), caption, "white", font, stroke_width=2, stroke_fill="black")
     return small
 
 
