@@ -8,9 +8,9 @@ from scenes import camera, exact_map, poses
 from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.landmarks import choose_landmarks
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.localization.verification import WEIGHTS, Evidence
+from slimsfm.localization.progressive import choose_landmarks
+from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import observed
 
 GOOD = Evidence(inliers=80, distinct=60, matched=100, predicted_error=0.004, rival=0, found=0.6)
@@ -32,13 +32,13 @@ def test_confidence_never_rises_as_evidence_gets_worse(name):
 
 
 def test_weights_fit_the_terms_and_have_the_sign_that_reason_demands():
-    assert WEIGHTS.shape == GOOD.terms.shape
-    assert np.all(WEIGHTS[1:] >= 0)
+    assert EVIDENCE_WEIGHTS.shape == GOOD.terms.shape
+    assert np.all(EVIDENCE_WEIGHTS[1:] >= 0)
 
 
 def found_with(evidence_of, query, lens, strategy="exhaustive"):
     options = LocalizationOptions(strategy=strategy, min_confidence=0.0)
-    (*_, attempt) = Localizer(evidence_of, options).attempts(query, lens)
+    (*_, attempt) = Localizer(evidence_of, options).rounds(query, lens)
     return attempt
 
 
