@@ -28,7 +28,7 @@ def assert_same_outcomes(some, others):
             assert np.array_equal(one.pose.cam_from_world.matrix(), other.pose.cam_from_world.matrix())
 
 
-def test_a_folder_gives_what_its_images_give_one_by_one(boulder):
+def test_a_folder_gives_the_same_outcomes_as_its_images_one_by_one(boulder):
     localizer = Localizer(boulder.map)
     names = [path.name for path in boulder.query.image_paths]
     alone = {name: localizer.localize(read_image(boulder.queries / name)) for name in sorted(names)}
@@ -51,7 +51,7 @@ def test_progress_takes_one_step_per_image(boulder):
     assert seen == ["localize (progressive)"] * len(results)
 
 
-def test_gravity_serves_the_images_it_is_known_for(boulder):
+def test_gravity_is_used_for_the_images_that_have_it(boulder):
     localizer = Localizer(boulder.map)
     plain = localize_images(localizer, boulder.queries)
     (first, *rest) = plain
@@ -87,7 +87,7 @@ def test_results_are_written_to_a_path_that_is_a_string(boulder, tmp_path):
     assert [one["name"] for one in images] == list(results)
 
 
-def test_what_cannot_be_localized_is_refused_before_the_work_begins(boulder, tmp_path):
+def test_bad_input_is_refused_before_the_work_begins(boulder, tmp_path):
     with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
         localize_images(Localizer(boulder.map), boulder.queries, workers=0)
     with pytest.raises(InputError, match="no such folder"):
