@@ -158,6 +158,20 @@ def test_the_order_of_the_keypoints_does_not_matter(exact, options):
     assert np.array_equal(one.pose.cam_from_world.matrix(), other.pose.cam_from_world.matrix())
 
 
+def test_a_query_does_not_change_while_another_is_localized(exact, options):
+    localizer, one = Localizer(exact, options), exact.features["002.png"]
+    other = one[np.arange(len(one))[::-1]]
+    alone = list(localizer.rounds(one, camera()))
+    interrupted = []
+    for result in localizer.rounds(one, camera()):
+        interrupted.append(result)
+        localizer.localize_features(other, camera())
+    assert len(alone) == len(interrupted)
+    for a, b in zip(alone, interrupted, strict=True):
+        assert np.array_equal(a.matches.keypoints, b.matches.keypoints)
+        assert np.array_equal(a.matches.points, b.matches.points)
+
+
 def test_a_localizer_serves_several_threads(exact, options):
     localizer = Localizer(exact, options)
     queries = 4 * list(exact.features.values())
