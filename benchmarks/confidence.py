@@ -20,11 +20,10 @@ from deceptive_scenes import deceptions
 from scipy.optimize import minimize
 
 from slimsfm.evaluation.protocol import PreparedQuery
-from slimsfm.geometry import corner_error
+from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions
-from slimsfm.localization.verification import RIGHT
 from slimsfm.mapping.direct import direct_map
 from slimsfm.synthetic.objects import OBJECTS
 
@@ -102,13 +101,16 @@ def poses(
     scene: Scene, kind: str, localizer: Localizer, prepared: PreparedQuery, *, strange: bool
 ) -> Iterator[Example]:
     """The poses of all rounds."""
-    for attempt in localizer.attempts(prepared.features, prepared.query.camera):
+    for attempt in localizer.rounds(prepared.features, prepared.query.camera):
         if attempt.pose is None or attempt.evidence is None:
             continue
         truth = prepared.query.cam_from_world
         error = corner_error(attempt.pose.cam_from_world, truth, scene.references.box)
         yield Example(
-            scene=scene.name, kind=kind, terms=attempt.evidence.terms, right=not strange and error < RIGHT
+            scene=scene.name,
+            kind=kind,
+            terms=attempt.evidence.terms,
+            right=not strange and error < ADD_FRACTIONS[0],
         )
 
 

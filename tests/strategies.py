@@ -1,4 +1,4 @@
-"""The strategies that every test may run: those that need neither weights nor the deep-learning stack."""
+"""Strategies that every test can run because they need neither weights nor the deep-learning stack."""
 
 from slimsfm.localization import STRATEGIES
 

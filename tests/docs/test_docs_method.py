@@ -1,4 +1,4 @@
-"""The numbers of the page on the method are those of the code."""
+"""The numbers on the page about the method match the code."""
 
 import inspect
 import re
@@ -9,10 +9,11 @@ import pytest
 
 from slimsfm.domination import exact, random_greedy
 from slimsfm.evaluation import statistics
+from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions
-from slimsfm.reduction import ReductionOptions, trial
+from slimsfm.reduction import ReductionOptions, forecast
 from slimsfm.selection import information, problem
 
 PAGE = " ".join((Path(__file__).parents[2] / "docs" / "method.md").read_text(encoding="utf-8").split())
@@ -22,10 +23,10 @@ def default(function, name: str) -> float:
     return inspect.signature(function).parameters[name].default
 
 
-def test_the_weights_of_the_confidence_are_those_learned():
+def test_the_weights_of_the_confidence_match_the_code():
     formula = PAGE[PAGE.index(r"\log \frac{c}{1 - c}") :].partition("$$")[0]
     constant, *rest = re.findall(r"[=+-] (\d\.\d+)", formula)
-    assert [float(one) for one in (constant, *rest)] == verification.WEIGHTS.tolist()
+    assert [float(one) for one in (constant, *rest)] == verification.EVIDENCE_WEIGHTS.tolist()
 
 
 @pytest.mark.parametrize(
@@ -33,26 +34,26 @@ def test_the_weights_of_the_confidence_are_those_learned():
     [
         (r"\tau = {:g}", GraphOptions().threshold),
         (r"\tau = {:g}", ReductionOptions().threshold),
-        ("probability that $e < {:g}$", verification.RIGHT),
-        (r"c_t \ge {:g}", search._SURE),
-        (r"\hat{{e}}_t \le {:g}", search._EXACT),
-        (r"\hat{{e}}_t > {:g} \hat", search._SETTLED),
-        ("$c < {:g}$ is not given", LocalizationOptions().min_confidence),
+        ("probability that $e < {:g}$", ADD_FRACTIONS[0]),
+        (r"c_t \ge {:g}", search.SURE),
+        (r"\hat{{e}}_t \le {:g}", search.ACCURATE),
+        (r"\hat{{e}}_t > {:g} \hat", search.SETTLED),
+        ("$c < {:g}$ is discarded", LocalizationOptions().min_confidence),
         ("inliers within {:g} px", RansacOptions().max_error_px),
         (r"\sigma_0 = {:g}", problem.PRIOR_SIGMA),
-        ("anew, with replacement, {:g} times", statistics._RESAMPLES),
+        ("resampled with replacement, {:g} times", statistics._RESAMPLES),
         ("the smallest of {:g} |", default(random_greedy, "draws")),
-        ("Up to {:g} references", trial._MOST_TESTS),
+        ("Up to {:g} references", forecast._MOST_TESTS),
     ],
 )
-def test_a_number_is_the_code_s(words, value):
+def test_a_number_matches_the_code(words, value):
     assert words.format(value) in PAGE
 
 
-def test_what_is_said_in_words_is_so_too():
-    assert verification._CLEAR == 0.75  # three quarters of the inliers
-    assert verification._RIVAL.min_inliers == 6
-    assert search._REFUTING == 2
+def test_numbers_in_words_match_the_code():
+    assert verification.UNAMBIGUOUS == 0.75  # three quarters of the inliers
+    assert verification.RIVAL_RANSAC.min_inliers == 6
+    assert search.MIN_REFUTING == 2
     assert RansacOptions().min_inliers == 12
     assert default(exact, "time_limit_s") == 60  # a minute
     choosing = sys.modules[information.__module__]

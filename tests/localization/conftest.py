@@ -14,7 +14,7 @@ def boulder(tmp_path_factory) -> Rendered:
 
 @pytest.fixture(scope="session")
 def two_cameras(exact) -> Map:
-    """The images of the exact scene, the first one taken by a camera of its own."""
+    """The exact scene with a second camera for the first image."""
     model = pycolmap.Reconstruction()
     for camera_id in (1, 2):
         camera = pycolmap.Camera(exact.shared_camera.todict())

@@ -13,7 +13,7 @@ from strategies import CLASSICAL
 BLACK = np.zeros((240, 320, 3), np.uint8)
 
 
-def test_an_image_of_nothing_has_no_pose_but_took_time(boulder):
+def test_a_black_image_has_no_pose_but_times(boulder):
     found = Localizer(boulder.map).localize(BLACK)
     assert found.pose is None
     assert found.num_matches == 0
@@ -22,12 +22,12 @@ def test_an_image_of_nothing_has_no_pose_but_took_time(boulder):
     assert seconds.total == seconds.extract + seconds.match + seconds.pose
 
 
-def test_a_map_with_several_cameras_wants_one_given(two_cameras):
+def test_a_map_with_several_cameras_needs_a_given_camera(two_cameras):
     with pytest.raises(ValueError, match="camera must be given"):
         Localizer(two_cameras, LocalizationOptions(strategy="exhaustive")).localize(BLACK)
 
 
-def test_a_given_camera_serves_whatever_the_map_has(boulder):
+def test_a_given_camera_overrides_the_one_of_the_map(boulder):
     map_, path = boulder.map, boulder.mapping.image_paths[12]
     wrong = pycolmap.Camera(map_.shared_camera.todict())
     wrong.params = wrong.params * [1.3, 1.3, 1, 1]
@@ -37,7 +37,7 @@ def test_a_given_camera_serves_whatever_the_map_has(boulder):
 
 
 @pytest.mark.parametrize("shape", [(640, 480, 3), (480, 480, 3)], ids=str)
-def test_the_camera_of_the_map_does_not_stand_in_for_one_of_another_shape(exact, shape):
+def test_the_camera_of_the_map_is_not_used_for_another_aspect_ratio(exact, shape):
     with pytest.raises(ValueError, match=f"image of {shape[1]}x{shape[0]}"):
         Localizer(exact).localize(np.zeros(shape, np.uint8))
 
@@ -48,7 +48,7 @@ def test_a_camera_of_another_size_is_refused(exact):
 
 
 @pytest.mark.parametrize("strategy", CLASSICAL)
-def test_rendered_references_are_found_where_they_are(boulder, strategy):
+def test_rendered_references_get_their_known_poses(boulder, strategy):
     map_ = boulder.map
     localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
     for path in boulder.mapping.image_paths[4:20:5]:

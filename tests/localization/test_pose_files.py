@@ -43,7 +43,7 @@ def assert_equal_poses(read):
         assert np.allclose(pose.matrix(), FOUND[name].matrix(), rtol=0, atol=1e-9)
 
 
-def test_json_gives_the_poses_back_and_knows_of_the_lost(results, tmp_path):
+def test_json_holds_the_poses_and_the_images_that_were_not_localized(results, tmp_path):
     write_poses(tmp_path / "poses.json", results)
     data = json.loads((tmp_path / "poses.json").read_text())
     assert "x_in_cam = R @ x_in_world + t" in data["convention"]
@@ -70,7 +70,7 @@ def test_json_gives_the_poses_back_and_knows_of_the_lost(results, tmp_path):
     )
 
 
-def test_csv_gives_the_poses_back_and_knows_of_the_lost(results, tmp_path):
+def test_csv_holds_the_poses_and_the_images_that_were_not_localized(results, tmp_path):
     write_poses(tmp_path / "poses.csv", results)
     with (tmp_path / "poses.csv").open(newline="") as file:
         rows = {row["name"]: row for row in csv.DictReader(file)}
@@ -88,14 +88,14 @@ def test_csv_gives_the_poses_back_and_knows_of_the_lost(results, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["poses.txt", "poses.tum"])
-def test_tum_gives_the_poses_back_by_index(results, tmp_path, name):
+def test_tum_holds_the_poses_by_index(results, tmp_path, name):
     write_poses(tmp_path / name, results)
     table = np.loadtxt(tmp_path / name)
     names = list(TRUTH)
     assert_equal_poses({names[int(row[0])]: rigid(row[4:8], row[1:4]).inverse() for row in table})
 
 
-def test_colmap_reads_its_images_back(results, tmp_path):
+def test_colmap_reads_images_txt(results, tmp_path):
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera())
     model.write_text(tmp_path)

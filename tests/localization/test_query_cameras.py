@@ -43,37 +43,37 @@ def test_the_given_camera_follows_a_resized_image(exact, tmp_path):
 
 def test_a_given_camera_of_another_shape_is_refused(exact, tmp_path):
     path = photo(tmp_path / "a.jpg", (480, 640))
-    with pytest.raises(ImageError, match=r"a\.jpg: has 480x640 pixels, its --camera 640x480"):
+    with pytest.raises(ImageError, match=r"a\.jpg: has 480x640 pixels, but the given camera 640x480"):
         query_camera(exact, path, camera())
 
 
 def test_the_camera_of_the_map_comes_next(exact, tmp_path, px_per_mm):
-    silent = photo(tmp_path / "a.png")
-    assert np.array_equal(query_camera(exact, silent, None).params, camera().params)
+    without_exif = photo(tmp_path / "a.png")
+    assert np.array_equal(query_camera(exact, without_exif, None).params, camera().params)
     same = photo(tmp_path / "b.jpg", focal_35mm=round(502.5 / px_per_mm))
     assert np.array_equal(query_camera(exact, same, None).params, camera().params)
 
 
-def test_exif_of_another_focal_length_speaks_of_another_camera(exact, tmp_path, px_per_mm):
+def test_exif_of_another_focal_length_means_another_camera(exact, tmp_path, px_per_mm):
     chosen = query_camera(exact, photo(tmp_path / "a.jpg", focal_35mm=80), None)
     assert chosen.model_name == "SIMPLE_RADIAL"
     assert chosen.focal_length == pytest.approx(80 * px_per_mm)
     assert (chosen.width, chosen.height) == (640, 480)
 
 
-def test_exif_serves_where_the_map_has_no_camera_for_the_image(exact, two_cameras, tmp_path):
+def test_exif_is_used_if_the_map_has_no_camera_for_the_image(exact, two_cameras, tmp_path):
     upright = photo(tmp_path / "a.jpg", (480, 640), focal_35mm=35)
     assert query_camera(exact, upright, None).has_prior_focal_length
     plain = photo(tmp_path / "b.jpg", focal_35mm=35)
     assert query_camera(two_cameras, plain, None).has_prior_focal_length
 
 
-def test_without_any_of_them_the_user_is_asked(exact, two_cameras, tmp_path):
+def test_without_any_of_them_the_error_asks_for_a_camera(exact, two_cameras, tmp_path):
     for map_, path in (
         (exact, photo(tmp_path / "upright.png", (480, 640))),
         (two_cameras, photo(tmp_path / "plain.png")),
     ):
-        with pytest.raises(ImageError, match=f"{path.name}.*--camera FILE.*--focal unknown"):
+        with pytest.raises(ImageError, match=f"{path.name}.*give the camera.*, or estimate the focal length"):
             query_camera(map_, path, None)
 
 
@@ -89,23 +89,23 @@ def test_an_image_whose_focal_length_need_not_be_known_gets_a_guess(focal, exact
 
 
 @pytest.mark.parametrize("focal", ["approximate", "unknown"])
-def test_whatever_is_known_comes_before_a_guess(focal, exact, two_cameras, tmp_path, px_per_mm):
-    silent = photo(tmp_path / "a.png")
-    assert np.array_equal(query_camera(exact, silent, None, focal).params, camera().params)
-    assert query_camera(exact, silent, camera("SIMPLE_RADIAL"), focal).model_name == "SIMPLE_RADIAL"
-    told = query_camera(two_cameras, photo(tmp_path / "b.jpg", focal_35mm=80), None, focal)
-    assert told.focal_length == pytest.approx(80 * px_per_mm)
-    with pytest.raises(ImageError, match="its --camera 640x480"):
+def test_known_cameras_come_before_a_guess(focal, exact, two_cameras, tmp_path, px_per_mm):
+    without_exif = photo(tmp_path / "a.png")
+    assert np.array_equal(query_camera(exact, without_exif, None, focal).params, camera().params)
+    assert query_camera(exact, without_exif, camera("SIMPLE_RADIAL"), focal).model_name == "SIMPLE_RADIAL"
+    from_exif = query_camera(two_cameras, photo(tmp_path / "b.jpg", focal_35mm=80), None, focal)
+    assert from_exif.focal_length == pytest.approx(80 * px_per_mm)
+    with pytest.raises(ImageError, match="but the given camera 640x480"):
         query_camera(exact, photo(tmp_path / "c.png", (480, 640)), camera(), focal)
 
 
-def test_another_word_for_the_focal_length_is_refused(exact, tmp_path):
+def test_an_unknown_value_of_focal_is_refused(exact, tmp_path):
     with pytest.raises(ValueError, match="focal must be one of known, approximate, unknown, got 'guessed'"):
         unwrap(query_camera)(exact, photo(tmp_path / "a.png"), None, "guessed")
 
 
 @pytest.mark.parametrize("size", [(640, 480), (480, 640), (1, 1)], ids=str)
-def test_a_guess_is_the_one_of_colmap(size, tmp_path):
+def test_a_guess_equals_that_of_colmap(size, tmp_path):
     guess = guess_camera(*size)
     theirs = camera_from_exif(photo(tmp_path / "a.png", size))
     assert guess.model_name == "SIMPLE_RADIAL"
@@ -115,7 +115,7 @@ def test_a_guess_is_the_one_of_colmap(size, tmp_path):
 
 
 @pytest.mark.parametrize(("size", "name"), [((0, 480), "width"), ((640, -1), "height")], ids=str)
-def test_no_guess_for_an_image_without_pixels(size, name):
+def test_an_image_without_pixels_gets_no_guess(size, name):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
         guess_camera(*size)
 
@@ -130,12 +130,12 @@ def test_a_scaled_camera_sees_the_same_scene_scaled(size):
 
 
 @pytest.mark.parametrize("size", [(480, 640), (640, 400), (1, 1000)], ids=str)
-def test_another_ratio_of_the_sides_is_no_scaling(size):
+def test_another_aspect_ratio_cannot_be_scaled(size):
     assert scaled_camera(camera(), *size) is None
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"])
-def test_a_camera_is_read_as_colmap_writes_it(model, tmp_path):
+def test_a_camera_file_of_colmap_is_read(model, tmp_path):
     written = camera(model)
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(written)

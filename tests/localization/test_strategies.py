@@ -47,7 +47,7 @@ def descriptors_of_points(map_: Map) -> np.ndarray:
 
 
 def renamed(map_: Map) -> Map:
-    """The same map with the images' names, and so their order, turned round."""
+    """The same map with the names of the images, and so their order, reversed."""
     names = dict(zip(map_.images, reversed([f"x{name}" for name in map_.images]), strict=True))
     model = copy.deepcopy(map_.model)
     for image in model.images.values():
@@ -111,7 +111,7 @@ def test_equal_queries_get_equal_poses(exact, options):
     assert np.array_equal(matrices[0], matrices[2])
 
 
-def test_each_round_gives_all_matches_so_far_sorted_and_once(exact, options):
+def test_each_round_yields_all_matches_so_far_sorted_and_unique(exact, options):
     strategy = strategy_of(exact, options)
     assert isinstance(strategy, Strategy)
     of_image = exact.features["003.png"]
@@ -132,7 +132,7 @@ def test_each_round_gives_all_matches_so_far_sorted_and_once(exact, options):
     assert rounds[-1] == list(zip(seen.rows.tolist(), seen.points.tolist(), strict=True))
 
 
-def test_what_a_camera_should_see_it_does_see(exact, options):
+def test_visible_points_are_those_that_the_image_observes(exact, options):
     strategy = strategy_of(exact, options)
     for name, image in exact.images.items():
         for agreeing in (None, exact.observations[name].points[:20]):
@@ -143,7 +143,7 @@ def test_what_a_camera_should_see_it_does_see(exact, options):
 
 
 @pytest.mark.parametrize("kept", [1, 2, 5])
-def test_retrieval_matches_with_as_many_images_as_asked(exact, kept):
+def test_retrieval_matches_with_the_requested_number_of_images(exact, kept):
     options = LocalizationOptions(strategy="retrieval", matching=MatchingOptions(retrieved=kept))
     localizer = Localizer(exact, options)
     assert localizer.localize_features(exact.features["004.png"], camera()).references == kept
@@ -156,6 +156,20 @@ def test_the_order_of_the_keypoints_does_not_matter(exact, options):
     one, other = (localizer.localize_features(f, camera()) for f in (of_image, of_image[order]))
     assert np.array_equal(one.points2D, other.points2D)
     assert np.array_equal(one.pose.cam_from_world.matrix(), other.pose.cam_from_world.matrix())
+
+
+def test_a_query_does_not_change_while_another_is_localized(exact, options):
+    localizer, one = Localizer(exact, options), exact.features["002.png"]
+    other = one[np.arange(len(one))[::-1]]
+    alone = list(localizer.rounds(one, camera()))
+    interrupted = []
+    for result in localizer.rounds(one, camera()):
+        interrupted.append(result)
+        localizer.localize_features(other, camera())
+    assert len(alone) == len(interrupted)
+    for a, b in zip(alone, interrupted, strict=True):
+        assert np.array_equal(a.matches.keypoints, b.matches.keypoints)
+        assert np.array_equal(a.matches.points, b.matches.points)
 
 
 def test_a_localizer_serves_several_threads(exact, options):
@@ -180,13 +194,13 @@ def test_uniting_is_the_union_of_sets(parts):
     assert list(zip(matches.keypoints.tolist(), matches.points.tolist(), strict=True)) == united
 
 
-def test_an_unknown_strategy_is_named():
+def test_an_unknown_strategy_is_refused_by_name():
     known = ", ".join(sorted(STRATEGIES))
     with pytest.raises(ValueError, match=re.escape(f"strategy must be auto or one of {known}, got 'guess'")):
         LocalizationOptions(strategy="guess")
 
 
-def test_by_itself_it_matches_points_where_the_map_has_some_chosen_for_it(exact):
+def test_auto_matches_points_directly_if_the_map_has_chosen_points(exact):
     options = LocalizationOptions()
     assert options.strategy == "auto"
     assert options.strategy_for(exact) == "progressive"

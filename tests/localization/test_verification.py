@@ -8,9 +8,9 @@ from scenes import camera, exact_map, poses
 from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.landmarks import choose_landmarks
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.localization.verification import WEIGHTS, Evidence
+from slimsfm.localization.progressive import choose_landmarks
+from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import observed
 
 GOOD = Evidence(inliers=80, distinct=60, matched=100, predicted_error=0.004, rival=0, found=0.6)
@@ -31,24 +31,24 @@ def test_confidence_never_rises_as_evidence_gets_worse(name):
     assert all(0 < value < 1 for value in values)
 
 
-def test_weights_fit_the_terms_and_have_the_sign_that_reason_demands():
-    assert WEIGHTS.shape == GOOD.terms.shape
-    assert np.all(WEIGHTS[1:] >= 0)
+def test_there_is_a_weight_per_term_and_none_is_negative():
+    assert EVIDENCE_WEIGHTS.shape == GOOD.terms.shape
+    assert np.all(EVIDENCE_WEIGHTS[1:] >= 0)
 
 
 def found_with(evidence_of, query, lens, strategy="exhaustive"):
     options = LocalizationOptions(strategy=strategy, min_confidence=0.0)
-    (*_, attempt) = Localizer(evidence_of, options).attempts(query, lens)
-    return attempt
+    (*_, last) = Localizer(evidence_of, options).rounds(query, lens)
+    return last
 
 
-def test_an_exact_view_has_all_the_evidence(exact):
-    attempt = found_with(exact, exact.features["001.png"], camera())
-    evidence = attempt.evidence
+def test_an_exact_view_has_full_evidence(exact):
+    last = found_with(exact, exact.features["001.png"], camera())
+    evidence = last.evidence
     assert evidence.inliers == evidence.matched == len(exact.observations["001.png"].rows)
     assert evidence.rival == 0
     assert evidence.found > 0.9
-    assert attempt.pose.confidence == evidence.confidence > 0.9
+    assert last.pose.confidence == evidence.confidence > 0.9
 
 
 def seen_from(map_, cam_from_world, part=slice(None)):
@@ -79,7 +79,7 @@ def test_a_second_pose_that_explains_the_rest_is_a_rival(exact):
     assert evidence.confidence < alone.confidence
 
 
-def test_points_that_should_be_visible_and_are_not_lower_what_is_found(exact):
+def test_missing_visible_points_lower_the_share_found(exact):
     few = features([seen_from(exact, poses(11)[3], slice(0, 30))])
     assert found_with(exact, few, camera()).evidence.found == pytest.approx(30 / 120, abs=0.05)
 
@@ -110,7 +110,7 @@ def test_landmarks_are_seen_by_every_image():
     assert counts.min() >= 60
 
 
-def test_an_unsure_pose_is_not_given_out(exact):
+def test_an_unsure_pose_is_discarded(exact):
     query, lens = features([seen_from(exact, poses(11)[3])]), camera()
     sure = Localizer(exact).localize_features(query, lens)
     bar = LocalizationOptions(min_confidence=1.0)

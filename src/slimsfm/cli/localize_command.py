@@ -24,8 +24,13 @@ from slimsfm.errors import InputError
 from slimsfm.execution import num_cores, on_threads
 from slimsfm.gravity import Gravity
 from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
-from slimsfm.localization.cameras import FocalLength, query_camera, read_camera
-from slimsfm.localization.gravity_file import read_gravity
+from slimsfm.localization.cameras import (
+    FocalLength,
+    UnknownIntrinsicsError,
+    query_camera,
+    read_camera,
+    read_gravity,
+)
 from slimsfm.localization.pose_files import write_object_poses, write_poses, writer_for
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
@@ -75,7 +80,10 @@ def localize(
     given = read_camera(camera) if camera else None
     if gravity and (also or localization.focal != "known"):
         raise InputError("gravity goes with one map and a known focal length; leave out also or focal")
-    queries = _queries(maps, images, given, localization.focal)
+    try:
+        queries = _queries(maps, images, given, localization.focal)
+    except UnknownIntrinsicsError as error:
+        raise InputError(f"{error} (--camera FILE, --focal unknown)") from error
     downwards = read_gravity(gravity) if gravity else {}
     localizers = {name: Localizer(one, localization) for name, one in maps.items()}
     work = partial(_localize, MultiLocalizer(localizers), downwards)

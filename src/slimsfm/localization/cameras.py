@@ -1,28 +1,36 @@
-"""Which intrinsics a query has: given, those of the map, told by EXIF, or guessed."""
+"""What is known about a query image in advance: its intrinsics, and the direction of gravity."""
 
+import json
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float64
 
 from slimsfm.errors import ImageError, InputError
+from slimsfm.gravity import Gravity
 from slimsfm.mapping.map import Map
 from slimsfm.photos import camera_from_exif
 
 FocalLength = Literal["known", "approximate", "unknown"]
-"""How well the focal length of a query is known; unless it is, it is estimated with the pose."""
+"""How well the focal length of a query is known. If it is not known, it is estimated with the pose."""
 
-_GUESS = 1.2  # focal length over the longer side, as COLMAP guesses
-_SAME_FOCAL = 0.1  # relative difference up to which EXIF speaks of the map's camera, calibrated there better
+_GUESS = 1.2  # focal length over the longer side, the default of COLMAP
+_SAME_FOCAL = 0.1  # relative difference below which EXIF means the map's camera, whose calibration is better
 
 
-def read_camera(path: Path) -> pycolmap.Camera:
+class UnknownIntrinsicsError(ImageError):
+    """Nothing says what the intrinsics of an image are, or what was given is for another image size."""
+
+
+def read_camera(path: str | Path) -> pycolmap.Camera:
     """Read the one camera of a file in COLMAP's `cameras.txt` format: `ID MODEL WIDTH HEIGHT PARAMS...`.
 
     Raises:
-        InputError: The file is missing, or does not hold one camera.
+        InputError: The file is missing, or does not hold exactly one camera.
     """
+    path = Path(path)
     try:
         lines = [line.split() for line in path.read_text().splitlines()]
     except (OSError, UnicodeDecodeError) as error:
@@ -38,7 +46,7 @@ def read_camera(path: Path) -> pycolmap.Camera:
         raise ValueError("not this model's parameters")
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise InputError(
-            f"{path}: should hold one line `ID MODEL WIDTH HEIGHT PARAMS...` as COLMAP's cameras.txt has it"
+            f"{path}: should hold one line `ID MODEL WIDTH HEIGHT PARAMS...` as in COLMAP's cameras.txt"
         ) from error
 
 
@@ -50,7 +58,7 @@ def _is_usable(camera: pycolmap.Camera) -> bool:
 
 
 def scaled_camera(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.Camera | None:
-    """The camera of an image resized to this size; None where the sides' ratio is another."""
+    """The camera of an image resized to this size; None if the aspect ratio differs."""
     if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
         return None
     scaled = pycolmap.Camera(camera.todict())
@@ -59,14 +67,14 @@ def scaled_camera(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.
 
 
 def guess_camera(width: int, height: int) -> pycolmap.Camera:
-    """The camera of an image of which nothing but the size is known, such as one in memory.
+    """The camera of an image of which only the size is known, such as one in memory.
 
     Returns:
-        A SIMPLE_RADIAL camera without distortion, its focal length 1.2 times the longer side;
+        A SIMPLE_RADIAL camera without distortion, whose focal length is 1.2 times the longer side;
         `has_prior_focal_length` is False.
 
     Raises:
-        ValueError: A side is not positive.
+        ValueError: `width` or `height` is not positive.
     """
     for name, side in (("width", width), ("height", height)):
         if side < 1:
@@ -76,39 +84,67 @@ def guess_camera(width: int, height: int) -> pycolmap.Camera:
 
 
 def query_camera(
-    map: Map, path: Path, given: pycolmap.Camera | None, focal: FocalLength = "known"
+    map: Map, path: str | Path, given: pycolmap.Camera | None, focal: FocalLength = "known"
 ) -> pycolmap.Camera:
     """Choose the intrinsics of a query image.
 
-    The given camera if there is one; else the camera that all reference images share, unless EXIF tells of
-    another focal length or the image is of another shape; else what EXIF tells; else, where the focal length
-    need not be known, a guess of 1.2 times the longer side.
+    In this order: the given camera; the camera that all reference images share, unless EXIF gives another
+    focal length or the aspect ratio differs; the camera according to EXIF; a guess by `guess_camera`, if the
+    focal length need not be known.
 
     Raises:
-        ImageError: None of these serves.
-        ValueError: `focal` is none of its values.
+        UnknownIntrinsicsError: The given camera has another aspect ratio, or none is given and the focal
+            length must be known but is not.
+        ImageError: The file is not an image.
+        ValueError: `focal` is not a value of `FocalLength`.
     """
+    path = Path(path)
     if focal not in get_args(FocalLength):
         raise ValueError(f"focal must be one of {', '.join(get_args(FocalLength))}, got {focal!r}")
     exif = camera_from_exif(path)
     candidate = given or map.shared_camera
     scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
     if given and scaled is None:
-        raise ImageError(
-            f"{path}: has {exif.width}x{exif.height} pixels, its --camera {given.width}x{given.height}; "
-            "give the camera of this image"
+        raise UnknownIntrinsicsError(
+            f"{path}: has {exif.width}x{exif.height} pixels, but the given camera "
+            f"{given.width}x{given.height}; give the camera of this image"
         )
     if scaled and (given or not exif.has_prior_focal_length or _same_focal(exif, scaled)):
         return scaled
     if exif.has_prior_focal_length:
         return exif
     if focal == "known":
-        raise ImageError(
-            f"{path}: its focal length is unknown (no EXIF, and not of the map's camera); "
-            "give --camera FILE, or have it estimated with --focal unknown"
+        raise UnknownIntrinsicsError(
+            f"{path}: its focal length is unknown (no EXIF data, and not taken with the map's camera); "
+            "give the camera of this image, or estimate the focal length"
         )
     return guess_camera(exif.width, exif.height)
 
 
 def _same_focal(a: pycolmap.Camera, b: pycolmap.Camera) -> bool:
     return abs(a.mean_focal_length() / b.mean_focal_length() - 1) < _SAME_FOCAL
+
+
+def read_gravity(path: str | Path) -> dict[str, Gravity]:
+    """Read the direction of gravity per image, which phones record with their photos, from a JSON file.
+
+    The file holds `{"world": [x, y, z], "images": {NAME: [x, y, z], ...}}`. The first vector points down in
+    the frame of the map, the others in the camera frames of the upright images (x right, y down, z forward).
+    Vectors may have any length.
+
+    Raises:
+        InputError: The file is missing or has other contents.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text())
+        world = _vector(data["world"])
+        return {str(name): Gravity(in_world=world, in_cam=_vector(v)) for name, v in data["images"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f'{path}: should hold {{"world": [x, y, z], "images": {{NAME: [x, y, z], ...}}}} ({error})'
+        ) from error
+
+
+def _vector(values: object) -> Float64[np.ndarray, "3"]:
+    return np.array(values, np.float64).reshape(3)

@@ -1,7 +1,7 @@
 """Match the query against points of the map, each described by the mean of its observations [1].
 
-The strongest keypoints of a query are matched first: where they give a sure pose, the many weak ones are
-never looked at.
+The strongest keypoints of a query are matched first. If they give a sure pose, the many weak ones are not
+matched at all.
 
 References:
     [1] Sattler, Leibe and Kobbelt, Fast Image-based Localization using Direct 2D-to-3D Matching, ICCV 2011.
@@ -13,25 +13,25 @@ from jaxtyping import Int64
 
 from slimsfm.features import nearest_for
 from slimsfm.localization.matching import match_target
-from slimsfm.localization.point_descriptors import describe_points
+from slimsfm.localization.point_descriptors import mean_descriptors
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
 from slimsfm.mapping.map import Map
 
-_STRONGEST = (1024,)  # keypoints of the rounds before the last, which takes all
-_NARROWEST = 0.5  # cosine: a point may be seen from 60 degrees beside where it was seen from
+_STRONGEST = (1024,)  # keypoints per round before the last, which takes all
+_NARROWEST = 0.5  # cosine: a point may be visible 60 degrees away from where it was seen
 
 
 class Direct:
-    """Matches against all described points at once. O(keypoints x points) a query."""
+    """Matches against all described points at once. O(keypoints x points) per query."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:  # noqa: ARG002
         self._nearest = nearest_for(map.info.extractor)
-        self._described = map.point_descriptors or describe_points(map)
+        self._described = map.point_descriptors or mean_descriptors(map)
         self._positions = map.points3D_in_world[self._described.points].astype(np.float32)
         self._target = self._described.descriptors, self._described.points
 
     def rounds(self, query: Query) -> Rounds:
-        """Match the strongest keypoints, then all, with the points' mean descriptors."""
+        """Match the strongest keypoints with the points' mean descriptors, then all keypoints."""
         counts = [count for count in _STRONGEST if count < len(query.descriptors)]
         for count in (*counts, len(query.descriptors)):
             yield unite([match_target(query.descriptors[:count], self._target, self._nearest)])
@@ -41,10 +41,10 @@ class Direct:
         cam_from_world: pycolmap.Rigid3d,
         agreeing: Int64[np.ndarray, " _"] | None = None,  # noqa: ARG002
     ) -> Target:
-        """The points that were seen from about where the camera stands.
+        """The points that were seen from about the position of the camera.
 
-        Of unit vectors spread over a cone the mean has the length (1 + cosine of its half angle) / 2, so the
-        length of a point's direction tells how far around it was seen.
+        The mean of unit vectors spread over a cone has the length (1 + cosine of the half angle) / 2, so the
+        length of a point's direction gives the range of angles it was seen from.
         """
         if self._described.directions is None:
             return self._target

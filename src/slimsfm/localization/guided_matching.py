@@ -1,4 +1,4 @@
-"""Match points of a map near where they project under a pose that is about right."""
+"""Match points of a map near where they project, given an approximate pose."""
 
 from dataclasses import replace
 from math import ceil
@@ -12,10 +12,10 @@ from slimsfm.features import Extractor, Features, NearestOptions
 from slimsfm.geometry import Box, project
 from slimsfm.localization.strategy import PointMatches, Query, Target
 
-_MARGIN = 0.25  # of the box's picture, kept around it on each side
-_LEAST_PX = 64  # side of the smallest region
-_RADIUS = 0.08  # of the longer side of the image: how far a point may be from where it projects
-_MAX_RATIO = 0.9  # few rivals are left near a place, so the ratio test may be mild
+_MARGIN = 0.25  # of the size of the box in the image, added on each side
+_LEAST_PX = 64  # shortest side of a region
+_RADIUS = 0.08  # of the longer side of the image: largest distance between a keypoint and a projection
+_MAX_RATIO = 0.9  # few candidates are near a projection, so the ratio test may be lenient
 
 
 def extract_near(
@@ -25,18 +25,20 @@ def extract_near(
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
 ) -> Features:
-    """Features of the part of an image that shows a box and a margin, in pixels of the whole.
+    """Extract features in the part of an image that shows a box and a margin, in pixels of the whole image.
 
-    Where the box is out of sight, those of a part at the image's rim, the nearest to where it is.
+    If the box is out of sight, the part is the one at the edge of the image that is nearest to it.
     """
-    rows, columns = region_of_box(box, cam_from_world, camera)
+    rows, columns = _window_of_box(box, cam_from_world, camera)
     found = extractor.extract(np.ascontiguousarray(image[rows, columns]))
     shift = np.array([columns.start, rows.start], np.float32)
     size = (camera.width, camera.height)
     return replace(found, keypoints=found.keypoints + shift, image_size=size)
 
 
-def region_of_box(box: Box, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> tuple[slice, slice]:
+def _window_of_box(
+    box: Box, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
+) -> tuple[slice, slice]:
     """Rows and columns of an image that show a box and a margin."""
     corners = project(box.corners, cam_from_world, camera)
     corners = corners[np.isfinite(corners).all(axis=1)]
@@ -55,14 +57,15 @@ def match_near(
     camera: pycolmap.Camera,
     matching: NearestOptions = NearestOptions(),
 ) -> PointMatches:
-    """Match descriptors as `match_nearest` does, but only those near each other in the image.
+    """Match descriptors like `match_nearest`, but only those that are near each other in the image.
 
     Args:
         query: The query.
-        target: What it is matched with.
-        pixels: Where each of the target's points projects.
+        target: Descriptors and points to match it with.
+        pixels: Projection of each of the target's points.
         camera: The query's intrinsics.
-        matching: The largest angle between matched descriptors; the ratio test is milder.
+        matching: Gives the largest angle between matched descriptors; its ratio test is not used but a more
+            lenient one.
     """
     inside = np.isfinite(pixels).all(axis=1)
     descriptors, points, pixels = target[0][inside], target[1][inside], pixels[inside]

@@ -1,15 +1,13 @@
-"""From a query image to its pose."""
+"""Localize a query image against one map."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from threading import local
 from time import perf_counter
 
 import numpy as np
 import pycolmap
-from jaxtyping import Shaped
 
-from slimsfm.arrays import Descriptors, Image, Points2D, Points3D
+from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.features.methods import DETECTOR_FREE, importing, plugins, resolve
 from slimsfm.gravity import Gravity
@@ -20,14 +18,14 @@ from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, St
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions
 
-# Paths, not classes: naming a strategy must not import what it needs.
+# Paths, not classes: naming a strategy must not import its dependencies.
 STRATEGIES = {
     "direct": "slimsfm.localization.direct:Direct",
-    "exhaustive": "slimsfm.localization.exhaustive:Exhaustive",
+    "exhaustive": "slimsfm.localization.reference_images:Exhaustive",
     "onepose": "slimsfm.localization.onepose:OnePose",
     "onepose++": "slimsfm.localization.onepose_plus:OnePosePlus",
     "progressive": "slimsfm.localization.progressive:Progressive",
-    "retrieval": "slimsfm.localization.retrieval:Retrieval",
+    "retrieval": "slimsfm.localization.reference_images:Retrieval",
 }
 
 
@@ -36,23 +34,23 @@ class LocalizationOptions:
     """How queries are localized."""
 
     strategy: str = "auto"
-    """Match against each reference image (exhaustive), those that look like the query (retrieval), one after
-    the other until the pose is sure (progressive), or against the points, by their descriptors (direct) or by
-    a network (onepose, onepose++); auto: direct where the map has points chosen for it, exhaustive where it
-    was built without a detector, else progressive."""
+    """What to match against: every reference image (exhaustive), the images most similar to the query
+    (retrieval), one image after another until the pose is sure (progressive), or the points, by their
+    descriptors (direct) or by a network (onepose, onepose++). auto: direct if the map has points chosen for
+    it, exhaustive if it was built without a detector, else progressive."""
 
     matching: MatchingOptions = MatchingOptions()
-    """How strategies match."""
+    """How the strategy matches."""
 
     ransac: RansacOptions = RansacOptions()
-    """The pose search."""
+    """How the pose is estimated."""
 
     focal: FocalLength = "known"
-    """Whether the queries' focal length is known, known to 30 % (approximate), or unknown: then it is
-    estimated together with the pose."""
+    """Whether the focal length of the queries is known, known to 30 % (approximate), or unknown. If it is not
+    known, it is estimated together with the pose."""
 
     min_confidence: float = 0.5
-    """A pose less sure than this is not given out: the query counts as not localized."""
+    """Poses of lower confidence are discarded: the query counts as not localized."""
 
     def __post_init__(self) -> None:
         known = sorted({**STRATEGIES, **plugins("strategy")})
@@ -62,7 +60,7 @@ class LocalizationOptions:
             raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
 
     def strategy_for(self, map: Map) -> str:
-        """The strategy to use with a map."""
+        """Name of the strategy to use with a map."""
         if self.strategy != "auto":
             return self.strategy
         if map.info.extractor in DETECTOR_FREE:
@@ -71,11 +69,11 @@ class LocalizationOptions:
 
 
 def load_strategy(name: str, map: Map, options: MatchingOptions = MatchingOptions()) -> Strategy:
-    """Make the strategy of this name for a map.
+    """Create the strategy of this name for a map.
 
     Raises:
-        InputError: What it needs is missing.
-        MapError: It cannot work with such a map.
+        InputError: A package or weights that the strategy needs are missing.
+        MapError: The strategy cannot work with this kind of map.
     """
     with importing(f"strategy {name!r}"):
         return resolve({**plugins("strategy"), **STRATEGIES}[name])(map, options)
@@ -86,59 +84,64 @@ class Seconds:
     """Wall time of each stage."""
 
     extract: float
-    """Features of the query."""
+    """Extracting the features of the query."""
 
     match: float
-    """Query against map."""
+    """Matching the query with the map."""
 
     pose: float
-    """Pose from matches."""
+    """Estimating and verifying poses."""
 
     @property
     def total(self) -> float:
-        """All stages."""
+        """Sum of all stages."""
         return self.extract + self.match + self.pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Localization:
-    """What became of one query."""
+    """Outcome of one query."""
 
     pose: PoseEstimate | None
-    """Where the camera stood, or None: the query could not be localized."""
+    """Pose of the camera; None if the query could not be localized."""
 
     camera: pycolmap.Camera
-    """The intrinsics; with the focal length that was found where it was not known."""
+    """The intrinsics, with the estimated focal length if it was not known."""
 
     points2D: Points2D
-    """Pixels of the 2D-3D matches that the pose was sought in."""
+    """Pixels of the 2D-3D matches that the pose was estimated from."""
 
     points3D_in_world: Points3D
-    """For each of them the point of the map."""
+    """Point of the map for each of these pixels."""
 
     references: int
-    """Reference images that the query was matched with."""
+    """Number of reference images that the query was matched with."""
 
     predicted_corner_error: float | None = None
-    """Relative corner error to expect of the pose, should its inliers be right; None where there is none."""
+    """Expected relative corner error of the pose, if its inliers are right; None if there is no pose."""
 
     seconds: Seconds
-    """Time it took."""
+    """Wall time per stage."""
 
     @property
     def num_matches(self) -> int:
-        """How many 2D-3D matches there were."""
+        """Number of 2D-3D matches."""
         return len(self.points2D)
 
 
 class Localizer:
-    """Localizes query images against one map."""
+    """Localizes query images against one map. May be used by several threads at a time.
+
+    Attributes:
+        map: The map.
+        options: How queries are localized.
+        extractor: The extractor that the map was built with.
+    """
 
     def __init__(self, map: Map, options: LocalizationOptions = LocalizationOptions()) -> None:
         self.map = map
-        self._options = options
+        self.options = options
         self.extractor = load_extractor(map.info.extractor, map.info.extractor_options)
-        self._memory = local()
         self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
         self._search = Search(map, self._strategy, options.ransac, options.focal)
 
@@ -149,13 +152,13 @@ class Localizer:
 
         Args:
             image: Upright RGB.
-            camera: Its intrinsics; those of the map where all reference images share a camera and the sizes
-                agree up to a common scale. Where the focal length is unknown, a guess will do.
-            gravity: Where down is in the map and in the image, as a phone tells; used where the focal length
-                is known.
+            camera: Its intrinsics. Default: the camera of the map, scaled to the image, if all reference
+                images share one of the same aspect ratio. A guess suffices if the focal length is not known.
+            gravity: Direction of gravity in the map and in the image, as a phone measures it; used only if
+                the focal length is known.
 
         Raises:
-            ValueError: No camera is given and the map's cannot stand in, or it is of another size.
+            ValueError: The camera has another image size, or none is given and the map's does not fit.
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
@@ -166,22 +169,22 @@ class Localizer:
     def localize_near(
         self, image: Image, camera: pycolmap.Camera | None, near_cam_from_world: pycolmap.Rigid3d
     ) -> Localization:
-        """Localize one image whose pose is about known, as that of the last frame of a video.
+        """Localize one image of approximately known pose, such as the next frame of a video.
 
-        Features are sought just where the object's box should be, and matched just with points that project
-        near them: several times faster than `localize`, and more points are found.
+        Extracts features only where the object's box should be, and matches them only with points that
+        project near them. Several times faster than `localize`, and finds more points.
 
         Args:
             image: Upright RGB.
-            camera: As of `localize`.
-            near_cam_from_world: A pose under which points project within a twelfth of the image's longer side
-                of where they are.
+            camera: As in `localize`.
+            near_cam_from_world: The approximate pose. Points must project within a twelfth of the image's
+                longer side of their true position.
 
         Returns:
-            No pose where the object is not about there; `localize` may find it elsewhere.
+            The outcome; without a pose if the object is not near there. `localize` may find it elsewhere.
 
         Raises:
-            ValueError: As of `localize`.
+            ValueError: As in `localize`.
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
@@ -191,7 +194,7 @@ class Localizer:
 
     @property
     def looks_at_images(self) -> bool:
-        """Whether features alone are not enough: the strategy looks at queries itself."""
+        """Whether `localize_features` needs the image too, because the strategy looks at it."""
         return isinstance(self._strategy, PoseGuided) or self.map.info.extractor in DETECTOR_FREE
 
     def localize_features(
@@ -201,17 +204,24 @@ class Localizer:
         gravity: Gravity | None = None,
         image: Image | None = None,
     ) -> Localization:
-        """Localize an image by features that its map's extractor gave, and by itself where that is needed."""
+        """Localize an image by its features.
+
+        Args:
+            features: Features of the image by `extractor`.
+            camera: Its intrinsics.
+            gravity: As in `localize`.
+            image: Upright RGB; needed only if `looks_at_images`.
+        """
         query = self._query(features, camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), 0.0)
 
-    def attempts(self, features: Features, camera: pycolmap.Camera) -> Iterator[RoundResult]:
-        """Everything that the strategy would try, round by round, without an early stop."""
-        return self._search.attempts(self._query(features, camera), camera)
+    def rounds(self, features: Features, camera: pycolmap.Camera) -> Iterator[RoundResult]:
+        """Run all rounds of the strategy, without stopping early."""
+        return self._search.rounds(self._query(features, camera), camera)
 
     def _localization(self, query: Query, found: SearchResult, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
-        if found.best.confidence < self._options.min_confidence:
+        if found.best.confidence < self.options.min_confidence:
             pose = evidence = None
         return Localization(
             pose=pose,
@@ -229,37 +239,33 @@ class Localizer:
             features = features[order]
         return Query(
             keypoints=features.keypoints.astype(np.float64),
-            descriptors=self._unit_rows(features.descriptors),
+            descriptors=unit_rows(features.descriptors),
             features=features,
             camera=camera,
             image=image,
         )
 
-    def _unit_rows(self, descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
-        """Rows of unit length, in memory that each thread uses again: fresh pages are dear."""
-        memory = getattr(self._memory, "rows", None)
-        count, dimensions = descriptors.shape
-        if memory is None or len(memory) < count or memory.shape[1] != dimensions:
-            memory = self._memory.rows = np.empty((count, dimensions), np.float32)
-        return unit_rows(descriptors, out=memory[:count])
-
     def camera_of(self, image: Image, given: pycolmap.Camera | None = None) -> pycolmap.Camera:
-        """The intrinsics of an image: those given, else those of the map, scaled.
+        """Intrinsics of an image: those given, else those of the map, scaled, else a guess if that suffices.
+
+        Args:
+            image: Upright RGB.
+            given: Intrinsics to use.
 
         Raises:
-            ValueError: There are none, or they are of an image of another size.
+            ValueError: The given camera has another image size, or none is given and the map's does not fit.
         """
         height, width = image.shape[:2]
         shared = self.map.shared_camera
         camera = given or (shared and scaled_camera(shared, width, height))
-        if camera is None and self._options.focal != "known":
+        if camera is None and self.options.focal != "known":
             camera = guess_camera(width, height)
         if camera is None:
             raise ValueError(
-                f"camera must be given: the map has no one camera for an image of {width}x{height} pixels"
+                f"camera must be given: the map has no single camera for an image of {width}x{height} pixels"
             )
         if (camera.width, camera.height) != (width, height):
             raise ValueError(
-                f"camera must be of the image's size {width}x{height}, got {camera.width}x{camera.height}"
+                f"camera must have the image's size {width}x{height}, got {camera.width}x{camera.height}"
             )
         return camera

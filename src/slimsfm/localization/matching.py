@@ -1,4 +1,4 @@
-"""How a query is matched with one reference image: nearest descriptors, a network, or without keypoints."""
+"""Match a query with one reference image: by nearest descriptors, by a network, or without keypoints."""
 
 from functools import lru_cache
 from importlib import import_module
@@ -14,31 +14,41 @@ from slimsfm.mapping.map import Map
 
 @runtime_checkable
 class ReferenceMatching(Protocol):
-    """Matches queries with the reference images of one map, numbered in order of name."""
+    """Matches queries with the reference images of one map, which are numbered in order of name."""
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:
-        """Match a query with an image; so many of its keypoints take part, where they are matched singly."""
+        """Match a query with an image.
+
+        Args:
+            query: The query.
+            row: The image.
+            strongest: Match only this many of the query's strongest keypoints, if the matcher matches
+                keypoints one by one; None for all.
+        """
         ...
 
     def target(self, row: int) -> Target:
-        """What the image sees."""
+        """Descriptors and points that the image sees."""
         ...
 
     def describe(self, query: Query) -> Descriptors:
-        """What a query looks like, in terms of what the images are described by; at most 2048 rows count."""
+        """Local descriptors of a query, of the kind that the images' global descriptors are made from.
+
+        Only the first 2048 rows are used.
+        """
         ...
 
 
 def matching_with(map: Map, options: MatchingOptions, cached: int | None = None) -> ReferenceMatching:
-    """The way of matching that the options ask for.
+    """Create the matching that the options ask for.
 
     Args:
         map: The map.
-        options: What matches.
-        cached: Images of which what there is to match is kept in memory; None: all.
+        options: Which matcher.
+        cached: Number of images whose descriptors stay in memory; None for all.
 
     Raises:
-        InputError: There is no such matcher, or it cannot match features of the map's kind.
+        InputError: The matcher is unknown, or cannot match features of the map's kind.
     """
     extractor = map.info.extractor
     name = options.matcher
@@ -52,9 +62,9 @@ def matching_with(map: Map, options: MatchingOptions, cached: int | None = None)
 
 
 class NearestMatching:
-    """Matches descriptors by their distance, just with keypoints that see a point of the map.
+    """Matches descriptors by their distance, only with keypoints that see a point of the map.
 
-    A match to any other keypoint gives the pose nothing.
+    Matches with other keypoints do not contribute to the pose.
     """
 
     def __init__(self, map: Map, options: NearestOptions, cached: int | None) -> None:
@@ -62,14 +72,14 @@ class NearestMatching:
         names = list(map.images)
         self._target = lru_cache(cached)(lambda row: reference_target(map, names[row]))
         for row in range(len(names) if cached is None else 0):
-            self._target(row)  # read now, not when the first query comes
+            self._target(row)  # read now, not for the first query
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:
         """Match a query's descriptors with those of an image."""
         return match_target(query.descriptors[:strongest], self._target(row), self._options, references=1)
 
     def target(self, row: int) -> Target:
-        """What the image sees."""
+        """Descriptors and points that the image sees."""
         return self._target(row)
 
     def describe(self, query: Query) -> Descriptors:
@@ -78,7 +88,7 @@ class NearestMatching:
 
 
 class PairMatching:
-    """Matches features by a network that looks at those of both images; just those that see a point."""
+    """Matches features by a network that sees those of both images; only keypoints that see a point."""
 
     def __init__(self, map: Map, matcher: Matcher, cached: int | None) -> None:
         self._matcher = matcher
@@ -86,7 +96,7 @@ class PairMatching:
         names = list(map.images)
         self._seeing = lru_cache(cached)(lambda row: _seeing(map, names[row]))
         for row in range(len(names) if cached is None else 0):
-            self._seeing(row)  # read now, not when the first query comes
+            self._seeing(row)  # read now, not for the first query
 
     def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:  # noqa: ARG002
         """Match all of a query's features with those of an image."""
@@ -94,7 +104,7 @@ class PairMatching:
         return PointMatches(keypoints=pairs[:, 0], points=self._points[row][pairs[:, 1]], references=1)
 
     def target(self, row: int) -> Target:
-        """What the image sees."""
+        """Descriptors and points that the image sees."""
         return unit_rows(self._seeing(row).descriptors), self._points[row]
 
     def describe(self, query: Query) -> Descriptors:
@@ -107,14 +117,14 @@ def _seeing(map: Map, name: str) -> Features:
 
 
 def reference_target(map: Map, name: str) -> Target:
-    """What there is to match of a reference image."""
+    """Descriptors and points that a reference image sees."""
     return unit_rows(_seeing(map, name).descriptors), map.observations[name].points
 
 
 def match_target(
     descriptors: Descriptors, target: Target, options: NearestOptions, references: int = 0
 ) -> PointMatches:
-    """Match descriptors of a query with those of points."""
+    """Match descriptors of a query with those of a target by nearest neighbors."""
     target_descriptors, points = target
     pairs = match_nearest(descriptors, target_descriptors, options)
     return PointMatches(keypoints=pairs[:, 0], points=points[pairs[:, 1]], references=references)

@@ -1,4 +1,4 @@
-"""Several maps at once: which objects are in an image, and where."""
+"""Localize an image against several maps: which objects it shows, and where."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,17 +13,21 @@ from slimsfm.localization.localizer import Localization, Localizer
 
 
 class MultiLocalizer:
-    """Localizes images against several maps; features that maps have in common are extracted once."""
+    """Localizes images against several maps; extracts features once for maps with the same extractor.
+
+    Attributes:
+        localizers: The localizer of each object's map, by name of the object.
+    """
 
     def __init__(self, localizers: Mapping[str, Localizer]) -> None:
         """Take a localizer for each object, by name of the object.
 
         Raises:
-            ValueError: There is none.
+            ValueError: `localizers` is empty.
         """
         if not localizers:
             raise ValueError("localizers must hold at least one")
-        self._localizers = dict(localizers)
+        self.localizers = dict(localizers)
 
     def localize(
         self,
@@ -31,23 +35,24 @@ class MultiLocalizer:
         cameras: Mapping[str, pycolmap.Camera | None] | None = None,
         gravity: Gravity | None = None,
     ) -> dict[str, Localization]:
-        """Seek every object in one image.
+        """Search one image for every object.
 
         Args:
             image: Upright RGB.
-            cameras: Intrinsics by object; None, or none given, stands for the camera of the object's map.
-            gravity: As of `Localizer.localize`, in the frame that all maps share.
+            cameras: Intrinsics by name of the object; where they are missing or None, those of the object's
+                map are used.
+            gravity: As in `Localizer.localize`; all maps must share one frame.
 
         Returns:
-            A localization by object, in the order of the localizers; those with a pose are in the image. The
-            time of extraction is told of the first that it serves.
+            The outcome by name of the object, in the order of the localizers. The image shows the objects
+            that have a pose. The time of a shared extraction counts for the first object only.
 
         Raises:
-            ValueError: As of `Localizer.localize`.
+            ValueError: As in `Localizer.localize`.
         """
         extracted: dict[str, Features] = {}
         found = {}
-        for name, localizer in self._localizers.items():
+        for name, localizer in self.localizers.items():
             camera = localizer.camera_of(image, (cameras or {}).get(name))
             info, start = localizer.map.info, perf_counter()
             key = repr((info.extractor, sorted(info.extractor_options.items())))

@@ -1,4 +1,6 @@
-"""What is known of each point of a map beside its position."""
+"""Describe the points of a map: mean descriptor, viewing direction, and whether other points look alike."""
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32
@@ -8,20 +10,34 @@ from slimsfm.features import nearest_for, unit_rows
 from slimsfm.features.vlad import learn_words, nearest_word
 from slimsfm.mapping.map import Map, PointDescriptors
 
-_ALIKE = 0.5  # of the largest angle between matching descriptors: look-alikes
-_FAR = 0.1  # of the diagonal: to take a point for one that is nearer hardly harms a pose
+_ALIKE = 0.5  # of the largest angle between matching descriptors: points look alike
+_FAR = 0.1  # of the diagonal: confusing a point with a nearer one hardly harms a pose
 
 
 def describe_points(map: Map) -> PointDescriptors:
-    """All points, each with the mean, made of unit length, of the descriptors of its observations."""
-    points = np.arange(len(map.point3D_ids), dtype=np.int64)
-    descriptors = unit_rows(descriptor_sums(map))
+    """Describe all points, including which of them look like no other point of the map."""
+    described = mean_descriptors(map)
+    return replace(described, distinct=_distinct(map, described.descriptors))
+
+
+def mean_descriptors(map: Map) -> PointDescriptors:
+    """Describe all points by the mean of their observations' descriptors, normalized, and by directions."""
     return PointDescriptors(
-        points=points,
-        descriptors=descriptors,
+        points=np.arange(len(map.point3D_ids), dtype=np.int64),
+        descriptors=unit_rows(descriptor_sums(map)),
         directions=_directions(map),
-        distinct=_distinct(map, descriptors),
     )
+
+
+def distinct_points(map: Map) -> Mask:
+    """Which points look like no other point of the map that is not near them, as stored or computed."""
+    stored = map.point_descriptors
+    if stored is None:
+        return _distinct(map, unit_rows(descriptor_sums(map)))
+    distinct = np.ones(len(map.point3D_ids), dtype=bool)
+    if stored.distinct is not None:
+        distinct[stored.points] = stored.distinct
+    return distinct
 
 
 def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
@@ -36,7 +52,7 @@ def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
 
 
 def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:
-    """Where each point was seen from: the mean unit vector towards the cameras that observe it."""
+    """Mean of the unit vectors from each point towards the cameras that observe it."""
     sums = np.zeros((len(map.point3D_ids), 3))
     counts = np.zeros(len(sums))
     for name, seen in map.observations.items():
@@ -50,7 +66,8 @@ def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:
 def _distinct(map: Map, descriptors: Descriptors) -> Mask:
     """Which points look like no other point of the map that is not near them.
 
-    Points are compared with those of the same word, which look-alikes mostly share. O(points^2 / words).
+    Points are only compared with those of the same visual word, which points that look alike mostly share.
+    O(points^2 / words).
     """
     points, far = map.points3D_in_world, _FAR * map.box.diagonal
     if not len(points):

@@ -1,4 +1,4 @@
-"""Poses on disk: JSON, CSV, TUM trajectories and COLMAP's images.txt, chosen by the file's name."""
+"""Write poses as JSON, CSV, TUM trajectories or COLMAP's images.txt; the name of the file decides."""
 
 import csv
 import json
@@ -14,35 +14,36 @@ from slimsfm.localization.localizer import Localization
 from slimsfm.pose import PoseEstimate
 
 Results = Mapping[str, Localization]
-"""What became of each query, by image name."""
+"""Outcome of each query, by image name."""
 
 ObjectResults = Mapping[str, Results]
-"""The same by object, where several were sought in each image."""
+"""The same by name of the object, if images were searched for several."""
 
 _Row = tuple[dict[str, str], Localization]
-"""Object, where there are several, and name of a query, and what became of it."""
+"""Object (if there are several) and name of a query, and its outcome."""
 
 
-def write_poses(path: Path, results: Results, *, overwrite: bool = False) -> None:
-    """Write poses in the format that the path's suffix names.
+def write_poses(path: str | Path, results: Results, *, overwrite: bool = False) -> None:
+    """Write poses in the format that the name of the file asks for.
 
-    .json and .csv hold every query, localized or not, with times; .txt holds those localized: as COLMAP's
-    images.txt if that is the file's name, else as a TUM trajectory (`index tx ty tz qx qy qz qw`, the pose of
-    the camera in the world, index counting the queries). COLMAP reads a name in
-    images.txt up to its first space.
+    - `.json` and `.csv` hold every query, localized or not, with times.
+    - `images.txt` holds the localized queries in COLMAP's format. COLMAP reads a name up to its first space.
+    - Any other `.txt`, and `.tum`, holds the localized queries as a TUM trajectory: one line
+      `index tx ty tz qx qy qz qw` per pose of a camera in the world; the index counts all queries.
 
     Raises:
-        OutputError: The suffix is none of these, or the file cannot be written.
+        OutputError: The suffix is unknown, or the file exists or cannot be written.
     """
-    _write(path, [({"name": name}, one) for name, one in results.items()], overwrite=overwrite)
+    _write(Path(path), [({"name": name}, one) for name, one in results.items()], overwrite=overwrite)
 
 
-def write_object_poses(path: Path, results: ObjectResults, *, overwrite: bool = False) -> None:
+def write_object_poses(path: str | Path, results: ObjectResults, *, overwrite: bool = False) -> None:
     """Write the poses of several objects, image by image, as .json or .csv.
 
     Raises:
-        OutputError: The suffix is neither of these, or the file cannot be written.
+        OutputError: The suffix is another one, or the file exists or cannot be written.
     """
+    path = Path(path)
     writer_for(path, several=True)
     names = dict.fromkeys(name for of_object in results.values() for name in of_object)
     rows = [
@@ -59,12 +60,13 @@ def _write(path: Path, rows: list[_Row], *, overwrite: bool) -> None:
         write(file, rows)
 
 
-def writer_for(path: Path, *, several: bool = False) -> Callable[[TextIO, list[_Row]], None]:
-    """The format that a path names.
+def writer_for(path: str | Path, *, several: bool = False) -> Callable[[TextIO, list[_Row]], None]:
+    """The function that writes the format that a path asks for.
 
     Raises:
-        OutputError: It names none, or one that has no place for several objects.
+        OutputError: The suffix is unknown, or its format cannot hold several objects.
     """
+    path = Path(path)
     if several and path.suffix not in _WITH_OBJECTS:
         raise OutputError(f"{path}: poses of several objects are written as .json or .csv")
     if path.name == "images.txt":
@@ -134,7 +136,7 @@ def _write_csv(file: TextIO, rows: list[_Row]) -> None:
 
 
 def _colmap_values(cam_from_world: pycolmap.Rigid3d) -> list[float]:
-    """Qw qx qy qz tx ty tz."""
+    """Rotation as w, x, y, z, then translation."""
     x, y, z, w = cam_from_world.rotation.quat.tolist()
     return [w, x, y, z, *cam_from_world.translation.tolist()]
 

@@ -1,4 +1,4 @@
-"""Match a query in rounds until its pose is sure and exact, or nothing is left to try."""
+"""Match a query in rounds until its pose is sure and accurate, or nothing is left to try."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,34 +13,42 @@ from slimsfm.geometry import project
 from slimsfm.gravity import Gravity, estimate_upright_pose
 from slimsfm.localization.cameras import FocalLength
 from slimsfm.localization.guided_matching import match_near
-from slimsfm.localization.point_descriptors import describe_points
+from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 
-_SURE = 0.95  # confidence
-_REFUTING = 2  # images that had the chance to contradict a pose whose inliers could be elsewhere
-_EXACT = 0.006  # predicted relative corner error
-_APPROXIMATE = 0.3  # by which an approximate focal length may be off
-_SETTLED = 0.8  # of the error of the round before: more matches no longer help much
+SURE = 0.95
+"""Confidence from which a pose is sure."""
+
+MIN_REFUTING = 2
+"""Number of images that could have contradicted an ambiguous pose, before the search may stop."""
+
+ACCURATE = 0.006
+"""Predicted relative corner error up to which a pose is accurate."""
+
+SETTLED = 0.8
+"""Share of the previous round's predicted error above which further matches no longer help much."""
+
+_APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RoundResult:
-    """What one round gave."""
+    """Result of one round."""
 
     matches: PointMatches
     """All matches so far."""
 
     pose: PoseEstimate | None
-    """The pose that they give, with its confidence."""
+    """The pose estimated from them, with its confidence."""
 
     camera: pycolmap.Camera
-    """The intrinsics; with the focal length that was found where it was not known."""
+    """The intrinsics, with the estimated focal length if it was not known."""
 
     evidence: Evidence | None
-    """What the confidence rests on; None where there is no pose."""
+    """What the confidence is computed from; None if there is no pose."""
 
     match_seconds: float
     """Wall time of matching in this round."""
@@ -50,19 +58,19 @@ class RoundResult:
 
     @property
     def confidence(self) -> float:
-        """That of the pose; below zero where there is none."""
+        """Confidence of the pose; below zero if there is none."""
         return -1.0 if self.pose is None else self.pose.confidence or 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchResult:
-    """The attempt that counts, and what all of them took."""
+    """The round that counts, and what all rounds took."""
 
     best: RoundResult
-    """The last that gave a pose: it knows all that those before knew, and what speaks against them."""
+    """The last round with a pose: it has the matches of all rounds before, and any that contradict them."""
 
     references: int
-    """Reference images that the query was matched with."""
+    """Number of reference images that the query was matched with."""
 
     match_seconds: float
     """Wall time of matching."""
@@ -81,21 +89,21 @@ class Search:
         self._strategy = strategy
         self._ransac = ransac
         self._focal: FocalLength = focal
-        self._verifier = Verifier(map, strategy, map.point_descriptors or describe_points(map))
+        self._verifier = Verifier(map, strategy, distinct_points(map))
 
     def run(self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None) -> SearchResult:
-        """Localize a query: try until it is enough."""
-        attempts: list[RoundResult] = []
-        for attempt in self.attempts(query, camera, gravity):
-            attempts.append(attempt)
-            if _is_enough(attempts):
+        """Localize a query; stop at the first round that suffices."""
+        rounds: list[RoundResult] = []
+        for one in self.rounds(query, camera, gravity):
+            rounds.append(one)
+            if _suffices(rounds):
                 break
-        return _summed(attempts)
+        return _summed(rounds)
 
     def near(
         self, query: Query, camera: pycolmap.Camera, near_cam_from_world: pycolmap.Rigid3d
     ) -> SearchResult:
-        """Localize a query that was taken about from there: points are sought near where they project."""
+        """Localize a query of approximately known pose: match points near where they project."""
         start = perf_counter()
         if isinstance(self._strategy, PoseGuided):
             matches = self._strategy.near(query, near_cam_from_world)
@@ -103,24 +111,24 @@ class Search:
             target = self._strategy.visible_points(near_cam_from_world)
             pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
             matches = match_near(query, target, pixels, camera, nearest_for(self._map.info.extractor))
-        return _summed([self._attempt(query, matches, camera, start)])
+        return _summed([self._result(query, matches, camera, start)])
 
-    def attempts(
+    def rounds(
         self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None
     ) -> Iterator[RoundResult]:
-        """Try everything, round by round."""
-        rounds, pose = self._strategy.rounds(query), None
+        """Run all rounds of the strategy."""
+        matching, pose = self._strategy.rounds(query), None
         while True:
             start = perf_counter()
             try:
-                matches = rounds.send(pose)
+                matches = matching.send(pose)
             except StopIteration:
                 return
-            attempt = self._attempt(query, matches, camera, start, gravity)
-            pose = attempt.pose
-            yield attempt
+            result = self._result(query, matches, camera, start, gravity)
+            pose = result.pose
+            yield result
 
-    def _attempt(
+    def _result(
         self,
         query: Query,
         matches: PointMatches,
@@ -163,22 +171,22 @@ class _Posed(NamedTuple):
     camera: pycolmap.Camera
 
 
-def _is_enough(attempts: list[RoundResult]) -> bool:
-    """Whether the last pose is sure, and exact or no longer becoming much more so."""
-    last = attempts[-1].evidence
-    if last is None or last.confidence < _SURE:
+def _suffices(rounds: list[RoundResult]) -> bool:
+    """Whether the last pose is sure, and accurate or not improving much."""
+    last = rounds[-1].evidence
+    if last is None or last.confidence < SURE:
         return False
-    if last.is_ambiguous and attempts[-1].matches.references < _REFUTING:
+    if last.is_ambiguous and rounds[-1].matches.references < MIN_REFUTING:
         return False
-    before = attempts[-2].evidence if len(attempts) > 1 else None
-    settled = before is not None and last.predicted_error > _SETTLED * before.predicted_error
-    return settled or last.predicted_error <= _EXACT
+    before = rounds[-2].evidence if len(rounds) > 1 else None
+    settled = before is not None and last.predicted_error > SETTLED * before.predicted_error
+    return settled or last.predicted_error <= ACCURATE
 
 
-def _summed(attempts: list[RoundResult]) -> SearchResult:
+def _summed(rounds: list[RoundResult]) -> SearchResult:
     return SearchResult(
-        best=next((one for one in reversed(attempts) if one.pose), attempts[-1]),
-        references=max(one.matches.references for one in attempts),
-        match_seconds=sum(one.match_seconds for one in attempts),
-        pose_seconds=sum(one.pose_seconds for one in attempts),
+        best=next((one for one in reversed(rounds) if one.pose), rounds[-1]),
+        references=max(one.matches.references for one in rounds),
+        match_seconds=sum(one.match_seconds for one in rounds),
+        pose_seconds=sum(one.pose_seconds for one in rounds),
     )

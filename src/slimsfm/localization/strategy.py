@@ -1,4 +1,4 @@
-"""What every way of matching a query against a map takes and gives."""
+"""Interface of strategies: what matching a query against a map takes and returns."""
 
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -15,42 +15,42 @@ from slimsfm.pose import PoseEstimate
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Query:
-    """A query and its local features, the strongest first."""
+    """A query and its local features, strongest keypoint first."""
 
     keypoints: Points2D
     """Pixels."""
 
     descriptors: Descriptors
-    """Row i describes keypoint i. Their memory is used again for the next query."""
+    """Row i describes keypoint i."""
 
     features: Features
-    """The features as the extractor gave them, in the same order."""
+    """The features as the extractor returned them, in the same order."""
 
     camera: pycolmap.Camera
-    """The intrinsics, or a guess of them where the focal length is not known."""
+    """The intrinsics; a guess where the focal length is unknown."""
 
     image: Image | None = None
-    """The image itself, for strategies that look at it; None where only its features are known."""
+    """The image, for strategies that use it; None if only its features are known."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointMatches:
-    """Matches between the keypoints of a query and the points of a map; a pair occurs once."""
+    """Matches between keypoints of a query and points of a map; no pair occurs twice."""
 
     keypoints: Ids
-    """Rows of the query's features, or of `points2D` where that is given."""
+    """Rows of the query's features, or of `points2D` if that is given."""
 
     points: Ids
     """Rows of the map's points."""
 
     references: int = 0
-    """Reference images that the query was matched with to find them."""
+    """Number of reference images that the query was matched with."""
 
     points2D: Float64[np.ndarray, "_ 2"] | None = None
-    """Pixels of keypoints that a strategy found itself; None where they are the query's."""
+    """Pixels of keypoints that the strategy found itself; None if they are the query's."""
 
     def pixels(self, query: Query) -> Points2D:
-        """Where in the query each match is."""
+        """Pixels of the matches in the query."""
         keypoints = query.keypoints if self.points2D is None else self.points2D
         return keypoints[self.keypoints]
 
@@ -69,64 +69,65 @@ class MatchingOptions:
     """How strategies match."""
 
     matcher: str = "auto"
-    """How the query and a reference image are matched; auto: by nearest neighbours, or without a detector
-    where the map was built so."""
+    """Matcher for a query and a reference image. auto: nearest neighbors, or without a detector if the map
+    was built that way."""
 
     retrieved: int = 2
-    """Reference images that `retrieval` matches a query with."""
+    """Number of reference images that `retrieval` matches a query with."""
 
     def __post_init__(self) -> None:
         if self.retrieved < 1:
             raise ValueError(f"retrieved must be at least 1, got {self.retrieved}")
 
 
-_SAME_PX = 4.0  # side of a square in which places of one point, each told by another image, are one
+_SAME_PX = 4.0  # side of a square in which several images' positions of a point count as one
 
 Target = tuple[Float32[np.ndarray, "_ d"], Int64[np.ndarray, " _"]]
-"""Descriptors to match a query with, and the point of each, a row of the map's points."""
+"""Descriptors to match a query with, and for each the row of its point in the map."""
 
 Rounds = Generator[PointMatches, PoseEstimate | None, None]
-"""Yields matches, ever more of them; is sent the pose that the last ones gave."""
+"""Yields matches, more in each round; receives the pose estimated from the last ones."""
 
 
 @runtime_checkable
 class Strategy(Protocol):
-    """Matches queries against one map. Made once for a map, then called for every query, on any thread."""
+    """Matches queries against one map. Created once per map, called for every query, on any thread."""
 
     def rounds(self, query: Query) -> Rounds:
-        """Match a query in rounds, what promises most first.
+        """Match a query in rounds, the most likely matches first.
 
-        Each round yields all matches so far. The caller estimates the pose and stops when it is sure of it;
-        else it sends the pose, or None, and the next round may look where that says.
+        Each round yields all matches so far. The caller estimates the pose and stops if it is sure of it.
+        Otherwise it sends the pose, or None, and the next round may use it to decide where to look.
         """
         ...
 
     def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
-        """What a camera should see that stands there, as far as nothing hides it.
+        """The points that a camera with this pose should see if nothing hides them.
 
         Args:
             cam_from_world: The pose.
-            agreeing: Points that agree with it, where they are known.
+            agreeing: Rows of points that agree with the pose, if known.
         """
         ...
 
 
 @runtime_checkable
 class PoseGuided(Protocol):
-    """A strategy that looks at a part of the image of its own, where the pose says that the object is."""
+    """A strategy that, given a pose, examines the part of the image that shows the object."""
 
     def near(self, query: Query, near_cam_from_world: pycolmap.Rigid3d) -> PointMatches:
-        """Match a query that was taken about from there."""
+        """Match a query whose pose is approximately known."""
         ...
 
 
 def unite(parts: Sequence[PointMatches]) -> PointMatches:
-    """Join matches from several sources; equal ones become one. Sorted by keypoint, then point.
+    """Join matches from several sources and drop duplicates. Sorted by keypoint, then point.
 
-    What strategies found themselves is equal where a point is found at the same place, to a pixel or two, by
-    several sources: one match is left, at the mean of the places, so that nobody counts it twice.
+    Matches at keypoints that strategies found themselves count as duplicates if they put the same point at
+    the same position, to a pixel or two. One match at the mean position replaces them, so that it counts
+    once.
     """
     keypoints = np.concatenate([np.zeros(0, np.int64), *_numbered_through(parts)])
     points = np.concatenate([np.zeros(0, np.int64), *(part.points for part in parts)])
@@ -139,7 +140,7 @@ def unite(parts: Sequence[PointMatches]) -> PointMatches:
 
 
 def _merged(points2D: Points2D, points: Ids, references: int) -> PointMatches:
-    """Matches of keypoints that strategies found themselves; each place of a point is one of its own."""
+    """Merge matches that put a point at the same position; each remaining one gets its own keypoint."""
     places = np.column_stack([points, np.round(points2D / _SAME_PX).astype(np.int64)])
     unique, which, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
     sums = np.zeros((len(unique), 2))
@@ -153,7 +154,7 @@ def _merged(points2D: Points2D, points: Ids, references: int) -> PointMatches:
 
 
 def _numbered_through(parts: Sequence[PointMatches]) -> list[Ids]:
-    """The parts' keypoints; those that strategies found themselves are rows of all such together."""
+    """Keypoints per part; rows of `points2D` become rows of all parts' `points2D` stacked."""
     numbered, start = [], 0
     for part in parts:
         numbered.append(part.keypoints + start)

@@ -1,18 +1,20 @@
-"""Is a pose right? One number says so: the probability that its corner error is below 0.1 of the diagonal.
+"""Confidence of a pose: the probability that its corner error is below 0.1 of the diagonal.
 
-Repeated texture, a twin of the object or a lucky few outliers give poses with many consistent inliers, so to
-count those is not enough. Five things are looked at, each of which a wrong pose finds hard to have:
+Repeated texture, a second object that looks the same, or a few chance outliers give wrong poses with many
+consistent inliers, so counting inliers is not enough. The confidence uses five quantities that are rarely
+good for a wrong pose:
 
-    distinct    how many keypoints agree with the pose whose points look like no other point of the map
-    share       how many of the matched keypoints agree with it
-    precision   how exactly the inliers fix the pose, were they right: the predicted corner error
-    rival       how many keypoints agree with the best other pose, by the matches that disagree with this one
-    found       which share of the points that should be visible has a keypoint that looks like it where it
-                projects, and none elsewhere that does as well
+    distinct    number of keypoints that agree with the pose and whose point looks like no other of the map
+    share       share of the matched keypoints that agree with the pose
+    precision   the predicted corner error: how well the inliers determine the pose if they are right
+    rival       number of keypoints that agree with the best other pose, among matches that disagree with
+                this one
+    found       share of the points that should be visible that have a similar keypoint where they project,
+                and no equally similar one elsewhere
 
-Their sum with fixed weights is the log-odds of being right: logistic regression on rendered and photographed
-scenes, some built to deceive, with weights held to the sign that reason demands. `benchmarks/confidence.py`
-learns them and shows how well probabilities and truth agree on scenes that were not learned from.
+Their weighted sum is the log-odds that the pose is right. The weights come from logistic regression on
+rendered and photographed scenes, some of them built to deceive; signs are constrained to the plausible ones.
+`benchmarks/confidence.py` learns the weights and measures the calibration on held-out scenes.
 """
 
 from dataclasses import dataclass
@@ -23,60 +25,61 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
 from slimsfm.features import nearest_for
-from slimsfm.geometry import corner_error, project
+from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
-from slimsfm.mapping.map import Map, PointDescriptors
+from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 
-RIGHT = 0.1
-"""Relative corner error below which a pose is right."""
+EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
+"""Weights of `Evidence.terms`, learned by `benchmarks/confidence.py`."""
 
-WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
-"""Of the terms of `Evidence`, learned by `benchmarks/confidence.py`."""
+RIVAL_RANSAC = RansacOptions(min_inliers=6, max_iterations=150)
+"""How the best other pose is estimated: finds a pose that a third of the remaining matches agrees with."""
 
-_RIVAL = RansacOptions(min_inliers=6, max_iterations=150)  # finds what a third of the rest agrees with
-_CLEAR = 0.75  # share of distinct inliers at which a pose is not ambiguous
-_CHECKED = 100  # visible points that are looked for
-_STRONGEST = 2048  # keypoints among which they are
-_NEAR_PX, _FAR_PX = 5.0, 15.0  # from where a point projects: it is there, it is elsewhere
-_MAX_RATIO = 0.9  # of the angle of the keypoint there to that of the best one elsewhere
+UNAMBIGUOUS = 0.75
+"""Share of distinct inliers from which a pose is unambiguous."""
+
+_CHECKED = 100  # visible points to look for
+_STRONGEST = 2048  # keypoints to look among
+_NEAR_PX, _FAR_PX = 5.0, 15.0  # distance from the projection of a point: at most there, at least elsewhere
+_MAX_RATIO = 0.9  # angle to the descriptor there over angle to the best one elsewhere
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What speaks for and against a pose."""
+    """What supports and what contradicts a pose."""
 
     inliers: int
-    """Keypoints that agree with it."""
+    """Number of keypoints that agree with the pose."""
 
     distinct: int
-    """Those of them whose points look like no other point of the map."""
+    """Number of those keypoints whose point looks like no other point of the map."""
 
     matched: int
-    """Keypoints that were matched."""
+    """Number of matched keypoints."""
 
     predicted_error: float
-    """Predicted relative corner error."""
+    """Predicted relative corner error, if the inliers are right."""
 
     rival: int
-    """Keypoints that agree with another pose, farther than a tenth of the diagonal, best of the rest."""
+    """Number of keypoints that agree with the best other pose, at a corner error of at least 0.1."""
 
     found: float
-    """Share of the points that should be visible that are found where they should be and nowhere else."""
+    """Share of the points that should be visible that are found where they project and nowhere else."""
 
     @property
     def confidence(self) -> float:
         """Probability that the pose is right."""
-        return float(1 / (1 + np.exp(-np.clip(WEIGHTS @ self.terms, -50, 50))))
+        return float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether many inliers could be elsewhere, or another pose shows: more should be looked at."""
-        return self.distinct < _CLEAR * self.inliers or self.rival > _RIVAL.min_inliers
+        """Whether many inliers look like other points, or another pose has support: more matches help."""
+        return self.distinct < UNAMBIGUOUS * self.inliers or self.rival > RIVAL_RANSAC.min_inliers
 
     @property
     def terms(self) -> Float64[np.ndarray, " terms"]:
-        """What the weights are multiplied with: a constant, and what grows with what speaks for the pose."""
+        """Factors of the weights: a constant, then quantities that grow with the support for the pose."""
         return np.array(
             [
                 1.0,
@@ -93,19 +96,24 @@ class Evidence:
 class Verifier:
     """Collects the evidence for poses in one map."""
 
-    def __init__(self, map: Map, strategy: Strategy, described: PointDescriptors) -> None:
+    def __init__(self, map: Map, strategy: Strategy, distinct: Mask) -> None:
+        """Prepare for a map.
+
+        Args:
+            map: The map.
+            strategy: The strategy whose matches are verified.
+            distinct: Which points of the map look like no other, by `distinct_points`.
+        """
         self._points3D_in_world = map.points3D_in_world
         self._box = map.box
         self._strategy = strategy
         self._alike = nearest_for(map.info.extractor).max_distance
-        self._distinct = np.ones(len(map.point3D_ids), dtype=bool)
-        if described.distinct is not None:
-            self._distinct[described.points] = described.distinct
+        self._distinct = distinct
 
     def evidence(
         self, query: Query, matches: PointMatches, pose: PoseEstimate, camera: pycolmap.Camera
     ) -> Evidence:
-        """Collect what speaks for and against a pose.
+        """Collect the evidence for a pose.
 
         Args:
             query: The query.
@@ -132,15 +140,16 @@ class Verifier:
         pose: PoseEstimate,
         camera: pycolmap.Camera,
     ) -> int:
-        """How many keypoints agree with the best other pose, by the matches that disagree with this one."""
+        """Number of keypoints that agree with the best other pose, among matches that contradict this one."""
         keypoints, points3D = matches.keypoints[others], self._points3D_in_world[matches.points[others]]
-        other = estimate_pose(pixels[others], points3D, camera, _RIVAL)
-        if other is None or corner_error(other.cam_from_world, pose.cam_from_world, self._box) < RIGHT:
+        other = estimate_pose(pixels[others], points3D, camera, RIVAL_RANSAC)
+        if other is None:
             return 0
-        return _count(keypoints[other.inliers])
+        apart = corner_error(other.cam_from_world, pose.cam_from_world, self._box)
+        return 0 if apart < ADD_FRACTIONS[0] else _count(keypoints[other.inliers])
 
     def _found(self, query: Query, agreeing: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> float:
-        """Which share of what should be visible is found, and found nowhere else."""
+        """Share of the points that should be visible that are found where they project and nowhere else."""
         descriptors, points = self._strategy.visible_points(pose.cam_from_world, agreeing)
         pixels = project(self._points3D_in_world[points], pose.cam_from_world, camera)
         inside = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=1)
@@ -152,12 +161,12 @@ class Verifier:
 
 
 def _count(keypoints: Ids) -> int:
-    """How many different keypoints there are: one may be matched with several points."""
+    """Number of different keypoints; one keypoint may be matched with several points."""
     return len(np.unique(keypoints))
 
 
 def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors, alike: float) -> Mask:
-    """Which places have a keypoint near them that looks as it should, better than any far from them."""
+    """Which places have a similar keypoint near them, and no equally similar one far from them."""
     keypoints = query.keypoints[:_STRONGEST]
     if not len(keypoints):
         return np.zeros(len(places), dtype=bool)

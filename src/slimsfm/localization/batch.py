@@ -1,0 +1,120 @@
+"""Localize all images of a folder, on several threads."""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import pycolmap
+
+from slimsfm.execution import num_cores, on_threads
+from slimsfm.gravity import Gravity
+from slimsfm.localization.cameras import query_camera
+from slimsfm.localization.localizer import Localization, Localizer
+from slimsfm.localization.multi import MultiLocalizer
+from slimsfm.photos import list_images, read_image
+from slimsfm.progress import ProgressBar, silent
+
+_ONLY = ""  # name of the object where there is one map
+
+
+def localize_images(
+    localizer: Localizer,
+    images: str | Path,
+    *,
+    camera: pycolmap.Camera | None = None,
+    gravity: Mapping[str, Gravity] | None = None,
+    workers: int | None = None,
+    progress: ProgressBar = silent,
+) -> dict[str, Localization]:
+    """Localize the images of a folder.
+
+    Results do not depend on the number of workers.
+
+    Args:
+        localizer: Localizer of the map.
+        images: A folder, searched recursively, or one image file.
+        camera: Intrinsics of all images, scaled to the size of each; chosen per image by `query_camera` if
+            not given.
+        gravity: Direction of gravity by image name; images may be missing.
+        workers: Images to localize at a time; the number of cores if not given.
+        progress: Progress bar, one step per image.
+
+    Returns:
+        The outcome of each image, localized or not, by its name relative to the folder, in sorted order.
+
+    Raises:
+        InputError: There is no image.
+        ImageError: An image cannot be read, or its intrinsics are not known well enough.
+        ValueError: `workers` is below 1, or `gravity` is given with a focal length that is not known.
+    """
+    focal = localizer.options.focal
+    if gravity and focal != "known":
+        raise ValueError(f"gravity needs a known focal length, got focal={focal!r}")
+    multi = MultiLocalizer({_ONLY: localizer})
+    return _localize(multi, Path(images), camera, gravity or {}, workers, progress)[_ONLY]
+
+
+def localize_objects(
+    localizer: MultiLocalizer,
+    images: str | Path,
+    *,
+    camera: pycolmap.Camera | None = None,
+    workers: int | None = None,
+    progress: ProgressBar = silent,
+) -> dict[str, dict[str, Localization]]:
+    """Search the images of a folder for several objects.
+
+    Arguments and errors are those of `localize_images`. Gravity is not among them because each map has a
+    frame of its own.
+
+    Returns:
+        For each object, in the order of the localizers, the outcome of each image by its name.
+    """
+    return _localize(localizer, Path(images), camera, {}, workers, progress)
+
+
+class _Task(NamedTuple):
+    name: str
+    path: Path
+    cameras: Mapping[str, pycolmap.Camera]
+
+
+def _localize(
+    localizer: MultiLocalizer,
+    images: Path,
+    camera: pycolmap.Camera | None,
+    gravity: Mapping[str, Gravity],
+    workers: int | None,
+    progress: ProgressBar,
+) -> dict[str, dict[str, Localization]]:
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers must be at least 1, got {workers}")
+    tasks = _tasks(localizer, images, camera)
+    run = on_threads(partial(_localize_one, localizer, gravity), tasks, workers or num_cores())
+    strategies = {one.options.strategy_for(one.map) for one in localizer.localizers.values()}
+    label = f"localize ({', '.join(sorted(strategies))})"
+    by_image = {task.name: next(run) for task in progress(tasks, label)}
+    return {key: {name: outcomes[key] for name, outcomes in by_image.items()} for key in localizer.localizers}
+
+
+def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | None) -> list[_Task]:
+    """All images with their intrinsics, so that an image without intrinsics fails before the work begins."""
+    folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
+    return [
+        _Task(
+            name=name,
+            path=folder / name,
+            cameras={
+                key: query_camera(one.map, folder / name, camera, one.options.focal)
+                for key, one in localizer.localizers.items()
+            },
+        )
+        for name in names
+    ]
+
+
+def _localize_one(
+    localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
+) -> dict[str, Localization]:
+    return localizer.localize(read_image(task.path), task.cameras, gravity.get(task.name))

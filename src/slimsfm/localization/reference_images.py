@@ -1,0 +1,150 @@
+"""Match the query against reference images: against all of them, or against those most similar to it [1].
+
+References:
+    [1] Sarlin, Cadena, Siegwart and Dymczyk, From Coarse to Fine: Robust Hierarchical Localization at Large
+        Scale, CVPR 2019.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float32, Float64, Int64
+from scipy.sparse import csr_array
+
+from slimsfm.arrays import Descriptors
+from slimsfm.features.vlad import vlad
+from slimsfm.localization.matching import ReferenceMatching, matching_with
+from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target, unite
+from slimsfm.mapping.global_descriptors import describe_images
+from slimsfm.mapping.map import Map, check_has_features, observed
+
+_STRONGEST = 2048  # keypoints that the global descriptor of a query is computed from
+
+
+class Exhaustive:
+    """Matches against all reference images. O(references x keypoints x points seen) per query.
+
+    The slowest strategy, and the one that the others are measured against.
+    """
+
+    def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
+        self._references = ReferenceImages(map, options)
+
+    def rounds(self, query: Query) -> Rounds:
+        """Match the query with every reference image, in one round."""
+        yield self._references.match(query)
+
+    def visible_points(
+        self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
+    ) -> Target:
+        """The points that one reference image near the pose sees."""
+        return self._references.visible_points(cam_from_world, agreeing)
+
+
+class Retrieval:
+    """Matches against a fixed number of reference images, the most similar by global descriptor [1]."""
+
+    def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
+        self._retrieved = options.retrieved
+        self._references = ReferenceImages(map, options)
+        self._ranking = ImageRanking(map)
+
+    def rounds(self, query: Query) -> Rounds:
+        """Match the query with the most similar reference images, in one round."""
+        order = np.argsort(-self._ranking.similarities(self._references.describe(query)), kind="stable")
+        yield self._references.match(query, order[: self._retrieved].tolist())
+
+    def visible_points(
+        self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
+    ) -> Target:
+        """The points that one reference image near the pose sees."""
+        return self._references.visible_points(cam_from_world, agreeing)
+
+
+class ReferenceImages:
+    """The reference images of a map, in order of name, and how to match a query with them."""
+
+    def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
+        """Read the images.
+
+        Raises:
+            MapError: The map has no image features because it was made for direct matching only.
+            InputError: The matcher is unknown, or cannot match features of the map's kind.
+        """
+        check_has_features(map)
+        self._matching: ReferenceMatching = matching_with(map, options)
+        self._sees = csr_array(observed(map), dtype=np.float32)
+        self._seen_by = csr_array(self._sees.T)
+        self._center = map.box.center
+        self._directions = np.array(
+            [_direction(image.cam_from_world(), self._center) for image in map.images.values()]
+        )
+        self._counts = np.maximum(np.diff(self._sees.indptr), 1).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self._counts)
+
+    def match(
+        self, query: Query, rows: Sequence[int] | None = None, strongest: int | None = None
+    ) -> PointMatches:
+        """Match a query with some images, or with all.
+
+        Args:
+            query: The query.
+            rows: The images; None for all.
+            strongest: Match only this many of the query's strongest keypoints, if the matcher matches
+                keypoints one by one.
+        """
+        chosen = range(len(self)) if rows is None else rows
+        return unite([self._matching.match(query, row, strongest) for row in chosen])
+
+    def describe(self, query: Query) -> Descriptors:
+        """Local descriptors of a query, of the kind that the images' global descriptors are made from."""
+        return self._matching.describe(query)
+
+    def sharing(self, points: Int64[np.ndarray, " _"]) -> Float32[np.ndarray, " references"]:
+        """Number of the given points that each image sees."""
+        return np.asarray(self._seen_by[points].sum(axis=0), np.float32)
+
+    def visible_points(
+        self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
+    ) -> Target:
+        """The points that one image sees, because a camera near it should see them too.
+
+        It is the image that sees most of the points that agree with the pose. Where these are not known, it
+        is the image whose direction towards the object is nearest to the camera's.
+        """
+        if agreeing is not None:
+            return self._matching.target(int(self.sharing(agreeing).argmax()))
+        towards = _direction(cam_from_world, self._center)
+        return self._matching.target(int((self._directions @ towards).argmax()))
+
+    def known_from(self, rows: Sequence[int]) -> Float32[np.ndarray, " references"]:
+        """The share of each image's points that some images see too."""
+        known = (self._sees[list(rows)].sum(axis=0) > 0).astype(np.float32)
+        return self._sees @ known / self._counts
+
+
+def _direction(
+    cam_from_world: pycolmap.Rigid3d, center: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3"]:
+    towards = cam_from_world.inverse().translation - center
+    return towards / max(float(np.linalg.norm(towards)), 1e-12)
+
+
+class ImageRanking:
+    """Compares a query with all reference images at once, by global descriptors."""
+
+    def __init__(self, map: Map) -> None:
+        self._global_descriptors = map.global_descriptors or describe_images(map)
+
+    def similarities(self, descriptors: Descriptors) -> Float32[np.ndarray, " references"]:
+        """Cosine between a query's global descriptor and that of each reference image, in order of name.
+
+        Args:
+            descriptors: Local descriptors of the query, strongest keypoint first.
+        """
+        return self._global_descriptors.descriptors @ vlad(
+            descriptors[:_STRONGEST], self._global_descriptors.vocabulary
+        )

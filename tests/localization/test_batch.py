@@ -1,0 +1,110 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image as PillowImage
+
+from slimsfm.errors import ImageError, InputError
+from slimsfm.gravity import Gravity
+from slimsfm.localization import (
+    LocalizationOptions,
+    Localizer,
+    MultiLocalizer,
+    localize_images,
+    localize_objects,
+)
+from slimsfm.localization.cameras import read_gravity
+from slimsfm.localization.pose_files import write_object_poses, write_poses
+from slimsfm.photos import read_image
+
+
+def assert_same_outcomes(some, others):
+    assert list(some) == list(others)
+    for name, one in some.items():
+        other = others[name]
+        assert (one.pose is None) == (other.pose is None)
+        assert np.array_equal(one.points2D, other.points2D)
+        if one.pose:
+            assert np.array_equal(one.pose.cam_from_world.matrix(), other.pose.cam_from_world.matrix())
+
+
+def test_a_folder_gives_the_same_outcomes_as_its_images_one_by_one(boulder):
+    localizer = Localizer(boulder.map)
+    names = [path.name for path in boulder.query.image_paths]
+    alone = {name: localizer.localize(read_image(boulder.queries / name)) for name in sorted(names)}
+    assert sum(one.pose is not None for one in alone.values()) > 0
+    for workers in (None, 1, 3):
+        assert_same_outcomes(localize_images(localizer, boulder.queries, workers=workers), alone)
+    first = sorted(names)[0]
+    assert_same_outcomes(localize_images(localizer, str(boulder.queries / first)), {first: alone[first]})
+
+
+def test_progress_takes_one_step_per_image(boulder):
+    seen = []
+
+    def progress(items, label):
+        for item in items:
+            seen.append(label)
+            yield item
+
+    results = localize_images(Localizer(boulder.map), boulder.queries, progress=progress)
+    assert seen == ["localize (progressive)"] * len(results)
+
+
+def test_gravity_is_used_for_the_images_that_have_it(boulder):
+    localizer = Localizer(boulder.map)
+    plain = localize_images(localizer, boulder.queries)
+    (first, *rest) = plain
+    cam_from_world = plain[first].pose.cam_from_world
+    down = np.array([0.0, 0.0, -1.0])
+    gravity = {first: Gravity(in_world=down, in_cam=cam_from_world.rotation.matrix() @ down)}
+    upright = localize_images(localizer, boulder.queries, gravity=gravity)
+    assert not np.array_equal(upright[first].pose.cam_from_world.matrix(), cam_from_world.matrix())
+    assert_same_outcomes({name: upright[name] for name in rest}, {name: plain[name] for name in rest})
+    unknown = Localizer(boulder.map, LocalizationOptions(focal="unknown"))
+    with pytest.raises(ValueError, match="gravity needs a known focal length, got focal='unknown'"):
+        localize_images(unknown, boulder.queries, gravity=gravity)
+
+
+def test_several_objects_are_searched_in_each_image(boulder, tmp_path):
+    localizers = {name: Localizer(boulder.map) for name in ("one", "other")}
+    results = localize_objects(MultiLocalizer(localizers), boulder.queries)
+    assert list(results) == ["one", "other"]
+    alone = localize_images(localizers["one"], boulder.queries)
+    for of_object in results.values():
+        assert_same_outcomes(of_object, alone)
+    write_object_poses(str(tmp_path / "poses.json"), results)
+    images = json.loads((tmp_path / "poses.json").read_text())["images"]
+    assert [(one["name"], one["object"]) for one in images] == [
+        (name, key) for name in alone for key in results
+    ]
+
+
+def test_results_are_written_to_a_path_that_is_a_string(boulder, tmp_path):
+    results = localize_images(Localizer(boulder.map), str(boulder.queries))
+    write_poses(str(tmp_path / "poses.json"), results)
+    images = json.loads((tmp_path / "poses.json").read_text())["images"]
+    assert [one["name"] for one in images] == list(results)
+
+
+def test_bad_input_is_refused_before_the_work_begins(boulder, tmp_path):
+    with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
+        localize_images(Localizer(boulder.map), boulder.queries, workers=0)
+    with pytest.raises(InputError, match="no such folder"):
+        localize_images(Localizer(boulder.map), tmp_path / "missing")
+    PillowImage.new("RGB", (240, 320)).save(tmp_path / "upright.png")
+    with pytest.raises(ImageError, match=r"upright\.png: its focal length is unknown"):
+        localize_images(Localizer(boulder.map), tmp_path)
+
+
+def test_gravity_is_read_by_image_name(tmp_path):
+    path = tmp_path / "gravity.json"
+    path.write_text(json.dumps({"world": [0, 0, -9.8], "images": {"a.jpg": [0, 9.8, 0]}}))
+    gravity = read_gravity(str(path))
+    assert list(gravity) == ["a.jpg"]
+    assert np.array_equal(gravity["a.jpg"].in_world, [0, 0, -9.8])
+    assert np.array_equal(gravity["a.jpg"].in_cam, [0, 9.8, 0])
+    for text in ("", "{}", '{"world": [0, 0, 1], "images": []}', '{"world": [0, 1], "images": {}}'):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"gravity\.json: should hold"):
+            read_gravity(path)
