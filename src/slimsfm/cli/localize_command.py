@@ -22,7 +22,6 @@ from slimsfm.cli.output import (
 )
 from slimsfm.errors import InputError
 from slimsfm.execution import num_cores, on_threads
-from slimsfm.gravity import Gravity
 from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
 from slimsfm.localization.cameras import FocalLength, query_camera, read_camera
 from slimsfm.localization.gravity_file import read_gravity
@@ -30,6 +29,7 @@ from slimsfm.localization.pose_files import write_object_poses, write_poses, wri
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
 from slimsfm.photos import list_images, read_image
+from slimsfm.pose import Gravity
 from slimsfm.progress import shown
 
 Found = dict[str, Localization]

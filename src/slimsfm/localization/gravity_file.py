@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from slimsfm.errors import InputError
-from slimsfm.gravity import Gravity
+from slimsfm.pose import Gravity
 
 
 def read_gravity(path: Path) -> dict[str, Gravity]:

@@ -5,7 +5,7 @@ import pycolmap
 
 from slimsfm.arrays import Points2D, Points3D
 from slimsfm.geometry import Box, corner_error, reprojection_errors
-from slimsfm.tracking.refine import refine_pose
+from slimsfm.pose import refine_pose
 
 _MAX_ERROR_PX = 6.0  # of a point that helps to find the second pose
 _LEAST_ERROR_PX = 0.25  # to expect of a right pose
@@ -37,7 +37,9 @@ def is_ambiguous(
         [1] Schweighofer and Pinz, Robust Pose Estimation from a Planar Target, PAMI 2006.
     """
     mirrored = _mirrored(points3D_in_world, cam_from_world)
-    second = refine_pose(points2D, points3D_in_world, mirrored, camera, _MAX_ERROR_PX).cam_from_world
+    second = refine_pose(
+        points2D, points3D_in_world, mirrored, camera, max_error_px=_MAX_ERROR_PX
+    ).cam_from_world
     if corner_error(cam_from_world, second, box) < _OTHER:
         return False
     first_px, second_px = (

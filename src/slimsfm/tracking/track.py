@@ -13,11 +13,10 @@ import pycolmap
 
 from slimsfm.arrays import Points2D
 from slimsfm.geometry import Box, project
-from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose, refine_pose
 from slimsfm.tracking.flow import follow_points
 from slimsfm.tracking.gray_frame import View
 from slimsfm.tracking.motion import foretold
-from slimsfm.tracking.refine import refine_pose
 from slimsfm.tracking.templates import Sighting, Templates, find
 
 MAX_CORNER_ERROR = 0.03
@@ -98,7 +97,7 @@ def _settled(
     if len(seen.rows) < max(_MIN_POINTS, _MIN_SHARE * seen.num_expected):
         return None
     points3D = templates.points3D_in_world[seen.rows]
-    pose = refine_pose(seen.points2D, points3D, guess, view.camera, _MAX_ERROR_PX)
+    pose = refine_pose(seen.points2D, points3D, guess, view.camera, max_error_px=_MAX_ERROR_PX)
     moved = project(points3D, pose.cam_from_world, view.camera) - project(points3D, guess, view.camera)
     if rounds > 1 and np.median(np.linalg.norm(moved, axis=1)) > _SETTLED_PX:
         return _settled(templates, view, pose.cam_from_world, box, rounds - 1)
