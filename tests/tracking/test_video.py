@@ -28,7 +28,7 @@ def write(path, images, rate=25.0, **options):
 @pytest.mark.parametrize("size", [(120, 160), (121, 161)], ids=str)
 def test_written_video_is_read_back(tmp_path, suffix, size):
     path, images = tmp_path / f"film{suffix}", pictures(6, *size)
-    write(path, images)
+    write(str(path), images)
     assert [path.name for path in tmp_path.iterdir()] == [path.name]
     frames = open_frames(str(path))
     assert frames.count in (6, None)
@@ -63,7 +63,7 @@ def test_video_of_a_phone_held_upright_is_read_upright(tmp_path):
 def test_images_of_a_folder_are_read_in_order(tmp_path):
     for i, image in enumerate(pictures(3)):
         Image.fromarray(image).save(tmp_path / f"{2 - i}.png")
-    frames = open_frames(str(tmp_path))
+    frames = open_frames(tmp_path)
     assert frames.count == 3
     read = list(frames.pictures)
     assert [frame.name for frame in read] == ["0.png", "1.png", "2.png"]
@@ -140,7 +140,7 @@ def silence(path):
 
 
 def test_error_names_an_empty_folder_and_a_broken_image(tmp_path):
-    with pytest.raises(InputError, match="holds no image"):
+    with pytest.raises(InputError, match="contains no image"):
         open_frames(str(tmp_path))
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(ImageError, match=r"text\.png"):

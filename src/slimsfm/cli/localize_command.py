@@ -21,7 +21,7 @@ from slimsfm.cli.output import (
     parse,
 )
 from slimsfm.errors import InputError
-from slimsfm.execution import num_cores, on_threads
+from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
 from slimsfm.localization.cameras import FocalLength, query_camera, read_camera
 from slimsfm.localization.gravity_file import read_gravity
@@ -79,7 +79,7 @@ def localize(
     downwards = read_gravity(gravity) if gravity else {}
     localizers = {name: Localizer(one, localization) for name, one in maps.items()}
     work = partial(_localize, MultiLocalizer(localizers), downwards)
-    run = on_threads(work, queries, workers or num_cores())
+    run = map_on_threads(work, queries, workers or num_cores())
     label = f"localize ({', '.join(sorted({localization.strategy_for(one) for one in maps.values()}))})"
     results = {query.name: next(run) for query in shown(queries, label)}
     by_object = {name: {image: one[name] for image, one in results.items()} for name in maps}
