@@ -17,7 +17,7 @@ import numpy as np
 
 from slimsfm.datasets.onepose import read_object
 from slimsfm.evaluation.protocol import Query, queries_of
-from slimsfm.execution import num_cores, on_threads
+from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer
 from slimsfm.mapping import read_map
@@ -52,7 +52,7 @@ def measure(output: Path, name: str, features: int, size: int) -> tuple[float, l
     localizer = Localizer(replace(map_, info=replace(map_.info, extractor_options=options)))
     queries = queries_of(read_object(output / "objects" / name).query)
     start = perf_counter()
-    found = list(on_threads(partial(localize, localizer), queries, num_cores()))
+    found = list(map_on_threads(partial(localize, localizer), queries, num_cores()))
     rate = len(queries) / (perf_counter() - start)
     errors = [
         corner_error(one.pose.cam_from_world, query.cam_from_world, map_.box) if one.pose else np.inf

@@ -1,4 +1,4 @@
-"""Pictures to track in: cloth of many colours, in grey."""
+"""Gray images of a random texture to track in."""
 
 import cv2
 import numpy as np

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from slimsfm.errors import OutputError
+from slimsfm.errors import OutputError, OutputExistsError
 from slimsfm.files import check_writable, remove, replacing
 from slimsfm.mapping.io import read_map, write_map
 
@@ -28,7 +28,7 @@ def content(path):
 
 
 @pytest.mark.parametrize("write", WRITERS)
-def test_a_result_appears_when_the_block_ends_and_not_before(tmp_path, write):
+def test_result_appears_when_the_block_ends_and_not_before(tmp_path, write):
     path = tmp_path / "new" / "folder" / "result"
     with replacing(path, overwrite=False) as partial:
         write(partial)
@@ -38,10 +38,21 @@ def test_a_result_appears_when_the_block_ends_and_not_before(tmp_path, write):
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_paths_may_be_strings(tmp_path):
+    path = str(tmp_path / "result")
+    check_writable(path, overwrite=False)
+    with replacing(path, overwrite=False) as partial:
+        write_file(partial)
+    with pytest.raises(OutputExistsError, match="exists already"):
+        check_writable(path, overwrite=False)
+    remove(path)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt, SystemExit])
 @pytest.mark.parametrize("old", [None, *WRITERS])
 @pytest.mark.parametrize("write", WRITERS)
-def test_a_failed_block_leaves_things_as_they_were(tmp_path, write, old, failure):
+def test_failed_block_changes_nothing(tmp_path, write, old, failure):
     path = tmp_path / "result"
     if old:
         old(path, "old")
@@ -68,7 +79,7 @@ def test_overwriting_swaps_files_and_folders(tmp_path, write, old):
 
 
 @pytest.mark.parametrize("old", WRITERS)
-def test_what_is_there_is_not_overwritten_unasked(tmp_path, old):
+def test_existing_output_is_not_overwritten_by_default(tmp_path, old):
     path = tmp_path / "result"
     old(path, "old")
     with pytest.raises(OutputError, match="exists already"), replacing(path, overwrite=False):
@@ -76,7 +87,7 @@ def test_what_is_there_is_not_overwritten_unasked(tmp_path, old):
     assert content(path) == "old"
 
 
-def test_remains_of_a_killed_run_are_swept_up(tmp_path):
+def test_leftovers_of_a_killed_run_are_removed(tmp_path):
     path = tmp_path / "result"
     with replacing(path, overwrite=False) as partial:
         write_folder(partial, "first")
@@ -88,7 +99,7 @@ def test_remains_of_a_killed_run_are_swept_up(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_block_that_makes_nothing_keeps_what_was_there(tmp_path):
+def test_block_that_writes_nothing_keeps_the_old_output(tmp_path):
     path = tmp_path / "result"
     path.write_text("old")
     with pytest.raises(OutputError, match="cannot be written"), replacing(path, overwrite=True):
@@ -97,25 +108,25 @@ def test_a_block_that_makes_nothing_keeps_what_was_there(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_failure_to_read_an_input_is_not_called_a_failure_to_write(tmp_path):
+def test_failure_to_read_an_input_is_not_reported_as_a_failure_to_write(tmp_path):
     with pytest.raises(FileNotFoundError), replacing(tmp_path / "result", overwrite=False) as partial:
         partial.write_text((tmp_path / "missing").read_text())
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_in_the_way_is_named(tmp_path):
+def test_error_names_a_file_in_place_of_a_folder(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="file is not a folder"):
         check_writable(tmp_path / "file" / "deep" / "result", overwrite=True)
 
 
-def test_a_name_that_no_file_can_have_is_an_output_error(tmp_path):
+def test_impossible_file_name_is_an_output_error(tmp_path):
     path = tmp_path / ("x" * 300)
     with pytest.raises(OutputError, match="cannot be written"), replacing(path, overwrite=False):
         pytest.fail("the block must not run")
 
 
-def test_removing_spares_what_a_link_points_at(tmp_path):
+def test_removing_a_link_keeps_its_target(tmp_path):
     write_folder(tmp_path / "kept")
     (tmp_path / "link").symlink_to(tmp_path / "kept")
     remove(tmp_path / "link")
@@ -125,7 +136,7 @@ def test_removing_spares_what_a_link_points_at(tmp_path):
 
 @pytest.fixture
 def mount(tmp_path):
-    """Mounts a small file system in memory, where that is allowed."""
+    """Mounts a small file system in memory, where permitted."""
     folder = tmp_path / "mounted"
     folder.mkdir()
 
@@ -143,13 +154,13 @@ def mount(tmp_path):
 
 
 @pytest.mark.parametrize("depth", ["result", "deep/result", "deep/deeper/result"])
-def test_a_read_only_file_system_is_an_output_error(mount, depth):
+def test_read_only_file_system_is_an_output_error(mount, depth):
     folder = mount("size=64k,ro")
     with pytest.raises(OutputError, match="cannot be written"), replacing(folder / depth, overwrite=False):
         pytest.fail("the block must not run")
 
 
-def test_a_read_only_parent_is_an_output_error(tmp_path):
+def test_read_only_parent_is_an_output_error(tmp_path):
     if os.geteuid() == 0:
         pytest.skip("root may write anywhere")
     tmp_path.chmod(0o500)
@@ -161,7 +172,7 @@ def test_a_read_only_parent_is_an_output_error(tmp_path):
         tmp_path.chmod(0o700)
 
 
-def test_a_full_disk_is_an_output_error_and_leaves_the_old_result(mount):
+def test_full_disk_is_an_output_error_and_keeps_the_old_result(mount):
     folder = mount("size=64k")
     path = folder / "result"
     path.write_text("old")
@@ -176,7 +187,7 @@ def test_a_full_disk_is_an_output_error_and_leaves_the_old_result(mount):
 
 
 @pytest.mark.parametrize("kilobytes", [*range(8, 128, 8), 200, 300])
-def test_a_map_on_a_small_disk_is_there_whole_or_not_at_all(mount, exact, kilobytes):
+def test_map_on_a_small_disk_is_written_completely_or_not_at_all(mount, exact, kilobytes):
     folder = mount(f"size={kilobytes}k")
     fits = kilobytes >= 200
     with nullcontext() if fits else pytest.raises(OutputError, match="cannot be written"):

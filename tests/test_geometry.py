@@ -30,7 +30,7 @@ def random_pose(rng):
 
 
 @given(seed=SEEDS, order=st.permutations(range(8)))
-def test_a_box_is_found_from_its_corners_in_any_order(seed, order):
+def test_box_is_found_from_its_corners_in_any_order(seed, order):
     box = random_box(np.random.default_rng(seed))
     found = Box.from_corners(box.corners[list(order)])
     gaps = np.linalg.norm(found.corners[:, None] - box.corners[None], axis=2)
@@ -40,7 +40,7 @@ def test_a_box_is_found_from_its_corners_in_any_order(seed, order):
 
 
 @given(seed=SEEDS)
-def test_the_diagonal_is_the_largest_distance_of_two_corners(seed):
+def test_diagonal_is_the_largest_distance_between_corners(seed):
     box = random_box(np.random.default_rng(seed))
     distances = np.linalg.norm(box.corners[:, None] - box.corners[None], axis=2)
     assert box.diagonal == pytest.approx(distances.max())
@@ -48,7 +48,7 @@ def test_the_diagonal_is_the_largest_distance_of_two_corners(seed):
 
 
 @given(seed=SEEDS)
-def test_points_that_are_no_corners_of_a_box_are_refused(seed):
+def test_points_that_are_not_the_corners_of_a_box_are_rejected(seed):
     rng = np.random.default_rng(seed)
     corners = random_box(rng).corners
     corners[int(rng.integers(8))] += np.ptp(corners, axis=0)
@@ -59,12 +59,12 @@ def test_points_that_are_no_corners_of_a_box_are_refused(seed):
 @pytest.mark.parametrize(
     "corners", [np.zeros((7, 3)), np.zeros((8, 3)), np.full((8, 3), np.nan)], ids=["seven", "point", "nan"]
 )
-def test_degenerate_corners_are_refused(corners):
+def test_degenerate_corners_are_rejected(corners):
     with pytest.raises(ValueError, match=r"corners|half_edges"):
         Box.from_corners(corners)
 
 
-def test_the_edges_are_twelve_in_three_directions():
+def test_box_has_twelve_edges_in_three_directions():
     directions = [tuple(np.abs(BOX.corners[i] - BOX.corners[j]).round(9)) for i, j in BOX_EDGES]
     assert len(BOX_EDGES) == 12
     assert sorted({d: directions.count(d) for d in directions}.items()) == [
@@ -75,7 +75,7 @@ def test_the_edges_are_twelve_in_three_directions():
 
 
 @given(seed=SEEDS)
-def test_the_corner_error_is_a_metric(seed):
+def test_corner_error_is_a_metric(seed):
     rng = np.random.default_rng(seed)
     a, b, c = (random_pose(rng) for _ in range(3))
     box = random_box(rng)
@@ -85,7 +85,7 @@ def test_the_corner_error_is_a_metric(seed):
 
 
 @given(seed=SEEDS, scale=st.floats(1e-3, 1e3))
-def test_the_corner_error_does_not_depend_on_the_unit(seed, scale):
+def test_corner_error_does_not_depend_on_the_unit(seed, scale):
     rng = np.random.default_rng(seed)
     a, b = random_pose(rng), random_pose(rng)
     box = random_box(rng)
@@ -94,20 +94,20 @@ def test_the_corner_error_does_not_depend_on_the_unit(seed, scale):
     assert corner_error(*scaled, scaled_box) == pytest.approx(corner_error(a, b, box))
 
 
-def test_a_shift_of_the_box_by_its_diagonal_is_an_error_of_one():
+def test_translation_by_the_diagonal_is_an_error_of_one():
     shift = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0, BOX.diagonal, 0]))
     assert corner_error(pycolmap.Rigid3d(), shift, BOX) == pytest.approx(1)
 
 
 @given(seed=SEEDS)
-def test_the_rotation_error_agrees_with_scipy(seed):
+def test_rotation_error_agrees_with_scipy(seed):
     a, b = (random_pose(np.random.default_rng([seed, i])) for i in range(2))
     expected = Rotation.from_quat(a.rotation.quat).inv() * Rotation.from_quat(b.rotation.quat)
     assert rotation_error_deg(a, b) == pytest.approx(np.degrees(expected.magnitude()), abs=1e-9)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 1e-9, 1e-6, 90.0, 179.9999999, 180.0])
-def test_the_rotation_error_is_exact_near_zero_and_half_a_turn(angle_deg):
+def test_rotation_error_is_exact_near_0_and_180_degrees(angle_deg):
     axis = np.array([2.0, -1.0, 2.0]) / 3
     start = random_pose(np.random.default_rng(0))
     turn = pycolmap.Rotation3d(axis * np.radians(angle_deg))
@@ -138,7 +138,7 @@ def test_projection_through_a_fisheye_agrees_with_opencv():
     assert project(points, cam_from_world, lens) == pytest.approx(expected[:, 0], abs=1e-9)
 
 
-def test_a_point_behind_the_camera_has_no_image_and_an_infinite_error():
+def test_point_behind_the_camera_has_no_projection_and_an_infinite_error():
     points = np.array([[0.0, 0, 2], [0, 0, -2]])
     pixels = project(points, pycolmap.Rigid3d(), camera())
     errors = reprojection_errors(np.full((2, 2), 240.0), points, pycolmap.Rigid3d(), camera())
@@ -148,5 +148,5 @@ def test_a_point_behind_the_camera_has_no_image_and_an_infinite_error():
     assert errors[1] == np.inf
 
 
-def test_projecting_nothing_gives_nothing():
+def test_projecting_no_points_gives_no_pixels():
     assert project(np.zeros((0, 3)), pycolmap.Rigid3d(), camera()).shape == (0, 2)

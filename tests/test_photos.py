@@ -12,7 +12,7 @@ UPRIGHT[0, 0], UPRIGHT[0, -1], UPRIGHT[-1, 0], UPRIGHT[-1, -1] = (
     (0, 0, 255),
     (255, 255, 0),
 )
-# What a camera stores whose picture is turned upright by each EXIF orientation.
+# Stored pixels of the upright image for each EXIF orientation.
 STORED = {
     1: lambda a: a,
     2: lambda a: a[:, ::-1],
@@ -47,18 +47,18 @@ def test_images_are_read_upright(tmp_path, orientation):
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_the_focal_length_comes_from_exif_and_the_size_is_upright(tmp_path, orientation):
+def test_focal_length_is_from_exif_and_size_is_upright(tmp_path, orientation):
     Image.fromarray(noise()).save(tmp_path / "a.jpg", exif=exif(orientation, focal_35mm=28))
     camera = camera_from_exif(tmp_path / "a.jpg")
-    diagonal_of_film, diagonal = np.hypot(36, 24), np.hypot(60, 40)
+    film_diagonal, diagonal = np.hypot(36, 24), np.hypot(60, 40)
     assert camera.has_prior_focal_length
-    assert camera.focal_length == pytest.approx(28 / diagonal_of_film * diagonal, rel=1e-4)
+    assert camera.focal_length == pytest.approx(28 / film_diagonal * diagonal, rel=1e-4)
     width, height = (60, 40) if orientation < 5 else (40, 60)
     assert (camera.width, camera.height) == (width, height)
     assert camera.params[1:].tolist() == [width / 2, height / 2, 0]
 
 
-def test_without_exif_the_focal_length_is_guessed_and_said_to_be(tmp_path):
+def test_without_exif_the_focal_length_is_guessed_and_marked_as_such(tmp_path):
     Image.fromarray(noise()).save(tmp_path / "a.jpg")
     camera = camera_from_exif(tmp_path / "a.jpg")
     assert not camera.has_prior_focal_length
@@ -66,7 +66,7 @@ def test_without_exif_the_focal_length_is_guessed_and_said_to_be(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA", "CMYK", "I;16"])
-def test_every_kind_of_pixel_is_read_as_rgb(tmp_path, mode):
+def test_every_color_mode_is_read_as_rgb(tmp_path, mode):
     gray = np.array([[0, 64], [128, 255]], np.uint8)
     values = gray.astype(np.uint16) * 257 if mode == "I;16" else gray
     image = Image.fromarray(values) if mode == "I;16" else Image.fromarray(gray).convert(mode)
@@ -76,14 +76,14 @@ def test_every_kind_of_pixel_is_read_as_rgb(tmp_path, mode):
     assert np.array_equal(read, np.repeat(expected[..., None], 3, axis=2))
 
 
-def test_masks_are_gray_of_any_colour(tmp_path):
+def test_masks_may_have_any_color(tmp_path):
     Image.fromarray(UPRIGHT).save(tmp_path / "mask.png")
     assert np.array_equal(read_mask(tmp_path / "mask.png") > 0, UPRIGHT.any(axis=2))
 
 
 @pytest.mark.parametrize("read", [read_image, read_mask, camera_from_exif])
 @pytest.mark.parametrize("damage", ["text", "empty", "folder", "missing"])
-def test_what_is_no_image_is_named(tmp_path, read, damage):
+def test_error_names_a_file_that_is_not_an_image(tmp_path, read, damage):
     path = tmp_path / "photo.jpg"
     if damage == "folder":
         path.mkdir()
@@ -94,7 +94,7 @@ def test_what_is_no_image_is_named(tmp_path, read, damage):
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "bmp", "tif"])
-def test_a_file_cut_short_is_an_image_error_at_any_length(tmp_path, suffix):
+def test_truncated_file_is_an_image_error_at_any_length(tmp_path, suffix):
     path = tmp_path / f"photo.{suffix}"
     Image.fromarray(noise()).save(path)
     whole = path.read_bytes()
@@ -104,7 +104,7 @@ def test_a_file_cut_short_is_an_image_error_at_any_length(tmp_path, suffix):
             read_image(path)
 
 
-def test_images_are_listed_in_order_with_folders_and_without_hidden_ones(tmp_path):
+def test_images_are_listed_in_order_with_subfolders_and_without_hidden_ones(tmp_path):
     for name in ("b.JPG", "a 1.png", "sub/c.jpeg", "sub/deep/ä.webp", ".hidden.png", ".trash/d.png", "e.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
@@ -112,15 +112,15 @@ def test_images_are_listed_in_order_with_folders_and_without_hidden_ones(tmp_pat
     assert list_images(tmp_path) == ["a 1.png", "b.JPG", "sub/c.jpeg", "sub/deep/ä.webp"]
 
 
-def test_a_folder_below_a_hidden_one_is_not_hidden_itself(tmp_path):
+def test_folder_inside_a_hidden_one_is_not_hidden(tmp_path):
     folder = tmp_path / ".cache" / "photos"
     folder.mkdir(parents=True)
     (folder / "a.png").write_bytes(b"")
     assert list_images(folder) == ["a.png"]
 
 
-def test_a_folder_without_images_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="holds no image"):
+def test_folder_without_images_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="contains no image"):
         list_images(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         list_images(tmp_path / "missing")
@@ -134,3 +134,12 @@ def test_shrinking_keeps_the_shape_and_leaves_small_images_alone(shape):
     assert small.shape[2:] == image.shape[2:]
     assert min(small.shape[:2]) == max(1, round(min(shape[:2]) * 20 / max(shape[:2])))
     assert shrink(image, max(shape[:2])) is image
+
+
+def test_paths_may_be_strings(tmp_path):
+    path = str(tmp_path / "a.png")
+    Image.fromarray(noise()).save(path)
+    assert np.array_equal(read_image(path), noise())
+    assert read_mask(path).shape == (40, 60)
+    assert camera_from_exif(path).width == 60
+    assert list_images(str(tmp_path)) == ["a.png"]

@@ -1,4 +1,4 @@
-"""Work for other processes, which import it by name; what it remembers lies in files."""
+"""Tasks for other processes, which import them by name; attempts are counted in files."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Counted:
-    """A task that fails in some way at its first attempts, which a file counts."""
+    """A task whose first attempts fail; a file counts the attempts."""
 
     number: int
     file: Path | None = None

@@ -1,13 +1,13 @@
-"""Array types that name their shapes: the letters n, m, d stand for any size, equal within one signature."""
+"""Array types with named shapes: the letters n, m, d stand for any size, equal within one signature."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 Points2D = Float64[np.ndarray, "n 2"]
-"""Pixels in COLMAP's convention: the centre of the top-left pixel is (0.5, 0.5)."""
+"""Pixels in COLMAP's convention: the center of the top-left pixel is (0.5, 0.5)."""
 
 Points3D = Float64[np.ndarray, "n 3"]
-"""Points in the frame that the variable's name says, in map units."""
+"""Points in map units, in the frame that the name of the variable says."""
 
 Descriptors = Float32[np.ndarray, "n d"]
 """Rows of unit length."""
@@ -22,4 +22,4 @@ GrayImage = UInt8[np.ndarray, "height width"]
 Ids = Int64[np.ndarray, " n"]
 
 IndexPairs = Int64[np.ndarray, "n 2"]
-"""Row (i, j): item i of the first matched with item j of the second."""
+"""Row (i, j) matches item i of the first set with item j of the second."""

@@ -1,21 +1,22 @@
-"""What can go wrong for a user, as one tree.
+"""Errors that a user can fix, as one tree of exceptions.
 
-    SlimsfmError            any failure that a user can mend; the command line prints it and exits with 2
-    ├── InputError          a file, folder or argument given by the user cannot be used
-    │   ├── ImageError      ... because an image cannot be read
-    │   ├── ModelError      ... because a COLMAP model is damaged or lacks something
-    │   └── MapError        ... because a map is damaged, incomplete or of a later format
-    ├── OutputError         a result cannot be written where the user asked
-    ├── ReconstructionError Structure from Motion found no model in the images
-    └── WorkError           work given to other processes or machines failed again and again
+    SlimsfmError                any failure that a user can fix; the command line prints it and exits with 2
+    ├── InputError              a file, folder or argument given by the user cannot be used
+    │   ├── ImageError          ... because an image cannot be read
+    │   ├── ModelError          ... because a COLMAP model is damaged or incomplete
+    │   └── MapError            ... because a map is damaged, incomplete or of a later format
+    ├── OutputError             a result cannot be written where the user asked
+    │   └── OutputExistsError   ... because it exists and may not be overwritten
+    ├── ReconstructionError     Structure from Motion found no model in the images
+    └── WorkError               a task on other processes or machines failed repeatedly
 
 A bad value in Python code is a plain `ValueError` that names the argument. An image that cannot be localized
-is no error: its pose is None.
+is not an error: its pose is None.
 """
 
 
 class SlimsfmError(Exception):
-    """A failure that its reader can mend; the message says what to do."""
+    """A failure that the user can fix; the message says how."""
 
 
 class InputError(SlimsfmError):
@@ -27,7 +28,7 @@ class ImageError(InputError):
 
 
 class ModelError(InputError):
-    """A COLMAP model is damaged or lacks something that is needed."""
+    """A COLMAP model is damaged or incomplete."""
 
 
 class MapError(InputError):
@@ -38,9 +39,13 @@ class OutputError(SlimsfmError):
     """A result cannot be written where the user asked."""
 
 
+class OutputExistsError(OutputError):
+    """The output exists and may not be overwritten."""
+
+
 class ReconstructionError(SlimsfmError):
     """Structure from Motion found no model in the images."""
 
 
 class WorkError(SlimsfmError):
-    """Work given to other processes or machines failed again and again."""
+    """A task on other processes or machines failed repeatedly."""

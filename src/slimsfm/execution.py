@@ -1,6 +1,6 @@
-"""Many independent pieces of work through one seam, `concurrent.futures.Executor`.
+"""Run many independent tasks: in this process, on local processes, or on a Dask cluster, with equal results.
 
-Knows only functions: serial, on processes of this machine, or on a Dask cluster, the results are the same.
+Tasks are function calls, and every way to run them is a `concurrent.futures.Executor`.
 """
 
 import logging
@@ -28,21 +28,20 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 OpenExecutor = Callable[[], AbstractContextManager[Executor]]
-"""Opens the means of execution; called anew when it broke."""
+"""Opens an executor; called again when the executor broke."""
 
 _ATTEMPTS = 3
-_CONNECT_S = 10  # a scheduler that answers does so at once
 _LOGGER = logging.getLogger(__name__)
 
 
 def num_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(sched_getaffinity(0))
 
 
 @contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Processes of this machine, each started afresh; Ctrl-C is for this one to handle."""
+    """Open a pool of new processes of this machine. Only this process handles Ctrl-C."""
     ignore = (signal.SIGINT, signal.SIG_IGN)
     with ProcessPoolExecutor(
         count, get_context("spawn"), initializer=signal.signal, initargs=ignore
@@ -55,11 +54,16 @@ def processes(count: int) -> Iterator[Executor]:
 
 
 @contextmanager
-def dask_cluster(address: str | None, workers: int) -> Iterator[Executor]:
-    """The Dask cluster whose scheduler has this address, or one of this machine with so many workers.
+def dask_cluster(address: str | None, workers: int, *, timeout_s: float = 10.0) -> Iterator[Executor]:
+    """Open a Dask cluster.
+
+    Args:
+        address: Address of its scheduler; None starts a cluster on this machine.
+        workers: Number of workers of a cluster on this machine.
+        timeout_s: Time within which the scheduler must answer.
 
     Raises:
-        WorkError: Dask is not installed, or nothing answers at the address.
+        WorkError: Dask is not installed, or no scheduler answers at the address.
     """
     try:
         from distributed import Client, LocalCluster
@@ -70,20 +74,20 @@ def dask_cluster(address: str | None, workers: int) -> Iterator[Executor]:
             cluster = address or opened.enter_context(
                 LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0")
             )
-            client = opened.enter_context(Client(cluster, timeout=_CONNECT_S))
+            client = opened.enter_context(Client(cluster, timeout=timeout_s))
         except (OSError, ValueError) as error:
             raise WorkError(f"{address}: no Dask scheduler answers there ({error})") from error
         yield client.get_executor(pure=False)
 
 
-def on_threads(
+def map_on_threads(
     function: Callable[[Task], Result], tasks: Iterable[Task], workers: int
 ) -> Generator[Result, None, None]:
-    """Apply a function to tasks on threads of this process; results come in the order of the tasks.
+    """Apply a function to tasks on threads of this process and yield the results in the order of the tasks.
 
-    For functions that spend their time outside of Python. While they run, the matrix library keeps to one
-    thread of its own, so that results are equal for any number of workers. At most twice as many tasks as
-    workers are under way, so results need not fit into memory.
+    This suits functions that spend their time outside of Python. While they run, the matrix library is
+    limited to one thread, so that results are equal for any number of workers. At most two tasks per worker
+    are in progress, so the results need not fit into memory.
     """
     waiting: deque[Future[Result]] = deque()
     with threadpool_limits(1), ThreadPoolExecutor(workers) as executor:
@@ -101,18 +105,18 @@ def on_threads(
 def run_tasks(
     function: Callable[[Task], Result], tasks: Sequence[Task], open_executor: OpenExecutor | None = None
 ) -> Generator[tuple[int, Result], None, None]:
-    """Apply a function to every task and yield (index, result) as they are done, in whatever order.
+    """Apply a function to every task and yield (index, result) in the order of completion.
 
-    A task that fails, or whose worker dies, is tried again, by another worker where there is one.
+    A task that fails, or whose worker dies, is retried, on another worker if there is one.
 
     Args:
-        function: Importable by name, and equal for equal tasks.
-        tasks: What it is applied to.
-        open_executor: Where the work is done; None: here, one task after the other.
+        function: A function that can be imported by name and returns equal results for equal tasks.
+        tasks: Arguments of the function.
+        open_executor: Opens the executor; None runs one task after the other in this process.
 
     Raises:
-        WorkError: A task failed three times, or three executors broke without a single result between; the
-            message names the task.
+        WorkError: A task failed three times, or three executors in a row broke without a result; the message
+            names the task.
     """
     if open_executor is None:
         for index, task in enumerate(tasks):
@@ -132,19 +136,19 @@ def run_tasks(
 def _one_round(
     function: Callable[[Task], Result], pending: dict[int, Task], executor: Executor, failures: Counter[int]
 ) -> Generator[tuple[int, Result], None, bool]:
-    """Run what is pending, once; what is done is taken out of it. Returns whether the executor broke."""
+    """Run all pending tasks once and remove those that succeed. Returns whether the executor broke."""
     try:
         futures = {executor.submit(function, task): index for index, task in pending.items()}
         for future in as_completed(futures):
             index = futures.pop(future)
             error = BrokenExecutor() if future.cancelled() else future.exception()
             if isinstance(error, BrokenExecutor):
-                _LOGGER.warning("a worker died; %d tasks are tried again: %s", len(pending), _named(pending))
-                return True  # the others of this round are lost too; a new executor takes them up
+                _LOGGER.warning("a worker died; retrying %d tasks: %s", len(pending), _named(pending))
+                return True  # the other tasks of this round are lost too; a new executor runs them
             if error is not None:
                 failures[index] += 1
                 _check(failures, error)
-                _LOGGER.warning("task %d failed and is tried again: %s", index, error)
+                _LOGGER.warning("task %d failed; retrying it: %s", index, error)
                 continue
             del pending[index]
             yield index, future.result()

@@ -1,4 +1,4 @@
-"""Writing: a result appears whole or not at all."""
+"""Atomic writes: a file or folder appears complete or not at all."""
 
 import shutil
 import signal
@@ -8,18 +8,20 @@ from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType
 
-from slimsfm.errors import OutputError
+from slimsfm.errors import OutputError, OutputExistsError
 
 
-def check_writable(path: Path, *, overwrite: bool) -> None:
-    """Refuse, before any work is done, an output that exists or has no folder to lie in.
+def check_writable(path: str | Path, *, overwrite: bool) -> None:
+    """Check, before any work is done, that an output can be written.
 
     Raises:
-        OutputError: The output exists and `overwrite` is off, or its parent is not a folder.
+        OutputExistsError: The output exists and `overwrite` is off.
+        OutputError: The parent of the output is not a folder.
     """
+    path = Path(path)
     try:
         if path.exists() and not overwrite:
-            raise OutputError(f"{path}: exists already; choose another output or pass --overwrite")
+            raise OutputExistsError(f"{path}: exists already; choose another output or overwrite it")
         parent = path.absolute().parent
         while not parent.exists():
             parent = parent.parent
@@ -30,15 +32,17 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
 
 
 @contextmanager
-def replacing(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Give a temporary path beside `path`, and rename it to `path` when the block ends well.
+def replacing(path: str | Path, *, overwrite: bool) -> Iterator[Path]:
+    """Yield a temporary path next to `path`, and rename it to `path` when the block succeeds.
 
-    The block makes a file or a folder at the temporary path. When it fails or is interrupted, what it wrote
-    is removed and whatever stood at `path` still does.
+    The block writes a file or a folder at the temporary path. If it fails or is interrupted, the temporary
+    output is removed and `path` stays as it was.
 
     Raises:
-        OutputError: The output cannot be written: it exists, or the disk is full or read-only.
+        OutputExistsError: The output exists and `overwrite` is off.
+        OutputError: The output cannot be written, for example because the disk is full or read-only.
     """
+    path = Path(path)
     check_writable(path, overwrite=overwrite)
     partial = path.absolute().parent / f".{path.name}.partial"
     try:
@@ -51,7 +55,7 @@ def replacing(path: Path, *, overwrite: bool) -> Iterator[Path]:
         _swap(partial, path)
     except OSError as error:
         if error.filename is not None and not Path(str(error.filename)).absolute().is_relative_to(partial):
-            raise  # reading something else failed: not ours to explain
+            raise  # reading another file failed: the caller reports that
         raise _cannot_write(path, error) from error
     finally:
         remove(partial)
@@ -68,15 +72,16 @@ def _swap(partial: Path, path: Path) -> None:
         if path.exists():
             path.rename(old)
         partial.rename(path)
-    except BaseException:  # an interruption, too, must not leave the place empty
+    except BaseException:  # restore the old output after an interruption as well
         if old.exists() and not path.exists():
             old.rename(path)
         raise
     remove(old)
 
 
-def remove(path: Path) -> None:
-    """Delete a file or folder, if it is there."""
+def remove(path: str | Path) -> None:
+    """Delete a file or folder if it exists; of a symbolic link, only the link."""
+    path = Path(path)
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -85,19 +90,19 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Put off Ctrl-C and SIGTERM until the block ends, for C code that would swallow what they raise."""
+    """Delay Ctrl-C and SIGTERM until the block ends, because some C code swallows the exceptions."""
     if current_thread() is not main_thread():
         yield
         return
-    put_off: list[tuple[int, FrameType | None]] = []
+    delayed: list[tuple[int, FrameType | None]] = []
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     ours = {number: handler for number, handler in handlers.items() if callable(handler)}
     for number in ours:
-        signal.signal(number, lambda number, frame: put_off.append((number, frame)))
+        signal.signal(number, lambda number, frame: delayed.append((number, frame)))
     try:
         yield
     finally:
         for number, handler in ours.items():
             signal.signal(number, handler)
-    for number, frame in put_off[:1]:
+    for number, frame in delayed[:1]:
         ours[signal.Signals(number)](number, frame)

@@ -1,4 +1,4 @@
-"""Boxes, and distances between poses.
+"""Boxes, projection, and distances between poses.
 
 A pose is a `pycolmap.Rigid3d` called `cam_from_world`: `x_in_cam = R @ x_in_world + t`.
 """
@@ -15,10 +15,10 @@ from slimsfm.arrays import Points2D, Points3D
 _SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 ADD_FRACTIONS = (0.1, 0.05, 0.02)
-"""Shares of the diagonal within which ADD-0.1d and its stricter kin count a pose as right."""
+"""Thresholds, as fractions of the diagonal, of ADD-0.1d and its stricter variants."""
 
 BOX_EDGES = tuple((i, j) for i, j in combinations(range(8), 2) if np.sum(_SIGNS[i] != _SIGNS[j]) == 1)
-"""Pairs of corners of a `Box` that its twelve edges join."""
+"""Pairs of corners of a `Box` joined by its twelve edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class Box:
     """
 
     center: Float64[np.ndarray, "3"]
-    """Centre, in the frame and unit of the map."""
+    """Center, in the frame and unit of the map."""
 
     half_edges: Float64[np.ndarray, "3 3"]
-    """Row i runs from the centre to the middle of the i-th face."""
+    """Row i points from the center of the box to the center of the i-th face."""
 
     def __post_init__(self) -> None:
         values = np.concatenate([self.center, self.half_edges.ravel()])
@@ -41,7 +41,7 @@ class Box:
 
     @property
     def corners(self) -> Float64[np.ndarray, "8 3"]:
-        """The eight corners."""
+        """The eight corners, in the frame and unit of the map."""
         return self.center + _SIGNS @ self.half_edges
 
     @property
@@ -51,10 +51,10 @@ class Box:
 
     @classmethod
     def from_corners(cls, corners: Points3D) -> "Box":
-        """Find the box whose corners, in any order, are the given ones.
+        """Find the box with the given corners, in any order.
 
         Raises:
-            ValueError: There are not 8 corners, or they are not those of a box (within 1 % of its diagonal).
+            ValueError: There are not 8 corners, or they do not form a box (within 1 % of its diagonal).
         """
         if corners.shape != (8, 3):
             raise ValueError(f"corners must be 8 points with 3 coordinates, got shape {corners.shape}")
@@ -66,7 +66,7 @@ class Box:
         gaps = [_hausdorff(box.corners, corners) for box in candidates]
         best = candidates[int(np.argmin(gaps))]
         if not min(gaps) < 0.01 * best.diagonal:
-            raise ValueError("corners must be the 8 corners of a box, but no three edges span the given ones")
+            raise ValueError("corners must be the 8 corners of a box, but no three edges span these points")
         return best
 
 
@@ -78,7 +78,7 @@ def _hausdorff(a: Points3D, b: Points3D) -> float:
 def project(
     points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
 ) -> Float64[np.ndarray, "n 2"]:
-    """Project points into an image, with the camera's distortion; NaN where a point has no image."""
+    """Project points into an image with the camera's distortion; NaN where a point does not project."""
     return np.asarray(camera.img_from_cam(cam_from_world * points3D_in_world), dtype=np.float64).reshape(
         -1, 2
     )
@@ -90,13 +90,16 @@ def reprojection_errors(
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
 ) -> Float64[np.ndarray, " n"]:
-    """Distances in pixels between points and where their 3D points project; infinite where they do not."""
+    """Distances in pixels between points and their projected 3D points; infinite where there is none."""
     errors = np.linalg.norm(project(points3D_in_world, cam_from_world, camera) - points2D, axis=1)
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
 def motions(points3D_in_cam: Points3D) -> Float64[np.ndarray, "n 3 6"]:
-    """How points move in the camera's frame when it is turned (radians, first three columns) and shifted."""
+    """Derivative of points in the camera's frame with respect to a motion of the points.
+
+    The first three columns are for a rotation in radians, the last three for a translation.
+    """
     x, y, z = points3D_in_cam.T
     moved = np.zeros((len(points3D_in_cam), 3, 6))
     moved[:, 0, 1], moved[:, 0, 2] = z, -y
@@ -107,7 +110,7 @@ def motions(points3D_in_cam: Points3D) -> Float64[np.ndarray, "n 3 6"]:
 
 
 def corner_error(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d, box: Box) -> float:
-    """Mean distance of the box's corners under two poses, over the box's diagonal."""
+    """Mean distance between the corners of the box under two poses, over its diagonal."""
     corners = box.corners
     distances = np.linalg.norm(a_cam_from_world * corners - b_cam_from_world * corners, axis=1)
     return float(distances.mean() / box.diagonal)
@@ -116,13 +119,13 @@ def corner_error(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.
 def rotation_error_deg(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d) -> float:
     """Angle of the rotation between two poses, in [0, 180].
 
-    Taken as the angle of a unit quaternion, which is accurate near 0 and 180 degrees, where the arc cosine of
-    the trace is not.
+    It is the angle of a unit quaternion, which is accurate near 0 and 180 degrees, unlike the arc cosine of
+    the trace.
     """
     x, y, z, w = (a_cam_from_world.rotation.inverse() * b_cam_from_world.rotation).quat
     return float(np.degrees(2 * np.arctan2(np.linalg.norm([x, y, z]), abs(w))))
 
 
 def translation_error(a_cam_from_world: pycolmap.Rigid3d, b_cam_from_world: pycolmap.Rigid3d) -> float:
-    """Distance, in map units, between where two poses put the world's origin before the camera."""
+    """Distance, in map units, between the positions of the world's origin in the two cameras' frames."""
     return float(np.linalg.norm(a_cam_from_world.translation - b_cam_from_world.translation))

@@ -1,4 +1,4 @@
-"""Image files: which there are, their upright pixels, and the camera that their EXIF data tells of."""
+"""Image files: list them, read their upright pixels, and guess their cameras from EXIF data."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,37 +26,41 @@ _UNREADABLE = (
 )
 
 
-def list_images(folder: Path) -> list[str]:
-    """Names of the images below a folder, relative to it, with forward slashes, sorted.
+def list_images(folder: str | Path) -> list[str]:
+    """List the images in a folder and its subfolders.
+
+    Returns:
+        Paths relative to the folder, with forward slashes, sorted; without hidden files and folders.
 
     Raises:
-        InputError: The folder does not exist or holds no image.
+        InputError: The folder does not exist or contains no image.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of images")
     paths = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     names = sorted(path.relative_to(folder).as_posix() for path in paths)
     names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
     if not names:
-        raise InputError(f"{folder}: holds no image ({', '.join(sorted(SUFFIXES))})")
+        raise InputError(f"{folder}: contains no image ({', '.join(sorted(SUFFIXES))})")
     return names
 
 
-def read_image(path: Path) -> Image:
-    """Read an image as RGB, turned upright as its EXIF orientation says.
+def read_image(path: str | Path) -> Image:
+    """Read an image as RGB and rotate it upright according to its EXIF orientation.
 
     Raises:
-        ImageError: The file is missing or is no complete image.
+        ImageError: The file is missing or not a complete image.
     """
     with _reading(path), PillowImage.open(path) as file:
         upright = ImageOps.exif_transpose(file)
-        if upright.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8, not scale them
+        if upright.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8 instead of scaling them
             upright = PillowImage.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
         return np.array(upright.convert("RGB"))
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _reading(path: str | Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
@@ -65,24 +69,24 @@ def _reading(path: Path) -> Iterator[None]:
         raise ImageError(f"{path}: not a readable image; remove or replace it") from error
 
 
-def read_mask(path: Path) -> GrayImage:
-    """Read a mask: features are kept where it is not black.
+def read_mask(path: str | Path) -> GrayImage:
+    """Read a mask of any color mode: features are kept where it is not black.
 
     Raises:
-        ImageError: The file is missing or is no complete image.
+        ImageError: The file is missing or not a complete image.
     """
     return read_image(path).max(axis=2)
 
 
-def camera_from_exif(path: Path) -> pycolmap.Camera:
-    """Guess the camera of an image: its focal length from EXIF, else 1.2 times the longer side.
+def camera_from_exif(path: str | Path) -> pycolmap.Camera:
+    """Guess the camera of an image: focal length from EXIF, or else 1.2 times the longer side.
 
     Returns:
-        A SIMPLE_RADIAL camera of the upright image without distortion; `has_prior_focal_length` tells
-        whether EXIF gave the focal length.
+        A SIMPLE_RADIAL camera of the upright image without distortion; `has_prior_focal_length` says
+        whether the focal length is from EXIF.
 
     Raises:
-        ImageError: The file is no image.
+        ImageError: The file is missing or not an image.
     """
     with _reading(path), PillowImage.open(path) as file:
         turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
@@ -94,7 +98,7 @@ def camera_from_exif(path: Path) -> pycolmap.Camera:
 
 
 def shrink(image: UInt8[np.ndarray, "_ _ *channels"], max_size: int) -> UInt8[np.ndarray, "_ _ *channels"]:
-    """Shrink an image, RGB or gray, so that its longer side has so many pixels; a smaller one stays."""
+    """Shrink an RGB or gray image so that its longer side has at most `max_size` pixels."""
     height, width = image.shape[:2]
     scale = min(1.0, max_size / max(height, width))
     if scale == 1.0:

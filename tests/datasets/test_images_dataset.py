@@ -101,7 +101,7 @@ def test_too_frequent_queries_are_refused_before_any_work(photos, making, every)
 
 
 def test_a_folder_without_photos_or_no_folder_is_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no image"):
+    with pytest.raises(InputError, match="contains no image"):
         Images(path=tmp_path).names()
     with pytest.raises(InputError, match="missing: no such folder of images"):
         Images(path=tmp_path / "missing").names()

@@ -5,7 +5,6 @@ import pytest
 from PIL import Image as PillowImage
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.gravity import Gravity
 from slimsfm.localization import (
     LocalizationOptions,
     Localizer,
@@ -16,6 +15,7 @@ from slimsfm.localization import (
 from slimsfm.localization.cameras import read_gravity
 from slimsfm.localization.pose_files import write_object_poses, write_poses
 from slimsfm.photos import read_image
+from slimsfm.pose.priors import Gravity
 
 
 def assert_same_outcomes(some, others):

@@ -177,7 +177,7 @@ def test_a_given_box_is_taken(rendered, tmp_path):
 def test_too_few_images_are_an_input_error(rendered, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
-    with pytest.raises(InputError, match="holds no image"):
+    with pytest.raises(InputError, match="contains no image"):
         build_map(folder, tmp_path / "w")
     shutil.copy(rendered.folder / rendered.names[0], folder / "only.png")
     with pytest.raises(InputError, match="holds 1 image; a map needs at least two"):

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scenes import BOX, exact_map
 from selection.random_problems import problem_of, problems, users
 from slimsfm.geometry import project
-from slimsfm.pose import RansacOptions, estimate_pose
+from slimsfm.pose import RansacOptions, estimate_pose, rms_corner_errors
 from slimsfm.selection import information
 from slimsfm.selection.information import _Choice
 from slimsfm.selection.leave_one_out import LeftOut
-from slimsfm.selection.problem import PRIOR_SIGMA, corner_errors
+from slimsfm.selection.problem import PRIOR_SIGMA
 from slimsfm.selection.usable_points import selection_problem
 
 quick = settings(deadline=None, max_examples=40)
@@ -131,7 +131,7 @@ def test_the_prediction_agrees_with_poses_estimated_from_noisy_pixels(kept):
     problem = selection_problem(map_, LeftOut(map_))
     points = np.random.default_rng(1).permutation(problem.num_points)[:kept]
     from_points = problem.information(points) - np.eye(6) / PRIOR_SIGMA**2
-    without_prior = corner_errors(np.linalg.inv(from_points), problem.corner_twists)
+    without_prior = rms_corner_errors(np.linalg.inv(from_points), problem.corner_twists)
     for row, name in list(enumerate(map_.images))[:2]:
         in_world, true = map_.points3D_in_world[points], map_.images[name].cam_from_world()
         found = root_mean_square_error(in_world, true, map_.camera(name))

@@ -28,7 +28,7 @@ class Sequence:
 
 @pytest.fixture(scope="session")
 def walk() -> Sequence:
-    """Around the object of the map by 2 degrees a frame; the second half begins on the other side."""
+    """Around the object by 2 degrees per frame; the second half begins on the other side."""
     take = mapping_take(NAME, MAPPING_FRAMES, 320, 240, seed=0)
     radius = np.linalg.norm(take.cam_from_object[0].inverse().translation)
     steps = np.arange(12)

@@ -1,4 +1,4 @@
-"""Templates of a plane that carries a cloth, seen by cameras whose pictures a homography gives exactly."""
+"""Templates of a textured plane, whose images from any pose a homography gives exactly."""
 
 import cv2
 import numpy as np
@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from pictures import cloth, grid
 from slimsfm.geometry import project
-from slimsfm.tracking.gray_frame import View
-from slimsfm.tracking.templates import cut_out, find, joined, spread
+from slimsfm.tracking.gray_frame import GrayFrame
+from slimsfm.tracking.templates import cut_templates, find_templates, join_templates, spread_over_cells
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[300.0, 300.0, 160.0, 120.0])
 DISTANCE = 3.0
 HERE = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, DISTANCE]))
-"""Straight before the plane z = 0."""
+"""A pose that shows the plane z = 0 from the front."""
 
 
 def rigid(turn_deg, translation):
@@ -23,12 +23,12 @@ def rigid(turn_deg, translation):
 
 
 def seen_from(cam_from_world, cloth_seen_from_here):
-    """What a camera sees of the plane that looks like this from HERE."""
+    """Image from a pose of the plane that looks like this from HERE."""
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     here, there = (project(corners, pose, CAMERA).astype(np.float32) - 0.5 for pose in (HERE, cam_from_world))
     homography = cv2.getPerspectiveTransform(here, there)
     gray = cv2.warpPerspective(cloth_seen_from_here, homography, (320, 240), flags=cv2.INTER_CUBIC)
-    return View(gray=gray, camera=CAMERA, scale=1.0)
+    return GrayFrame(gray=gray, camera=CAMERA, scale=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def templates():
     points2D = grid(margin=50, step=16)
     rays = np.asarray(CAMERA.cam_from_img(points2D))
     points3D = np.column_stack([rays * DISTANCE, np.zeros(len(rays))])
-    return cut_out(View(gray=cloth(), camera=CAMERA, scale=1.0), points2D, points3D, HERE)
+    return cut_templates(GrayFrame(gray=cloth(), camera=CAMERA, scale=1.0), points2D, points3D, HERE)
 
 
 @pytest.mark.parametrize(
@@ -48,29 +48,29 @@ def templates():
         rigid([0, 0, -10], [0, 0, 3.9]),
         rigid([12, -14, 5], [0, 0, 3.1]),
     ],
-    ids=["as it was", "rolled", "nearer", "farther", "slanted"],
+    ids=["unchanged", "rolled", "nearer", "farther", "slanted"],
 )
 def test_templates_are_found_from_another_pose(templates, pose):
     off = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.02, -0.015, 0.0])) * pose  # 2 or 3 pixels
-    sighting = find(templates, seen_from(pose, cloth()), off)
+    sighting = find_templates(templates, seen_from(pose, cloth()), off)
     assert sighting.num_expected > len(templates) / 2
     assert len(sighting.rows) >= 0.9 * sighting.num_expected
     true = project(templates.points3D_in_world[sighting.rows], pose, CAMERA)
     assert np.median(np.linalg.norm(sighting.points2D - true, axis=1)) < 0.15
 
 
-def test_the_light_does_not_matter(templates):
+def test_brightness_and_contrast_do_not_matter(templates):
     view = seen_from(HERE, cloth())
-    dim = View(gray=(40 + 0.5 * view.gray).astype(np.uint8), camera=CAMERA, scale=1.0)
-    bright, faint = find(templates, view, HERE), find(templates, dim, HERE)
+    dim = GrayFrame(gray=(40 + 0.5 * view.gray).astype(np.uint8), camera=CAMERA, scale=1.0)
+    bright, faint = find_templates(templates, view, HERE), find_templates(templates, dim, HERE)
     assert np.array_equal(bright.rows, faint.rows)
     assert np.allclose(bright.points2D, faint.points2D, atol=0.05)
 
 
-def test_what_is_covered_is_not_found(templates):
+def test_covered_templates_are_not_found(templates):
     half_covered = cloth()
     half_covered[:, 160:] = cloth(seed=1)[:, 160:]
-    sighting = find(templates, View(gray=half_covered, camera=CAMERA, scale=1.0), HERE)
+    sighting = find_templates(templates, GrayFrame(gray=half_covered, camera=CAMERA, scale=1.0), HERE)
     assert sighting.num_expected == len(templates)
     x = templates.points3D_in_world[sighting.rows, 0] * 100 + 160
     assert np.mean(x > 168) < 0.05
@@ -78,24 +78,24 @@ def test_what_is_covered_is_not_found(templates):
 
 
 @pytest.mark.parametrize("gray", [0, 128, 255])
-def test_nothing_is_found_in_a_picture_of_nothing(templates, gray):
-    view = View(gray=np.full((240, 320), gray, np.uint8), camera=CAMERA, scale=1.0)
-    assert len(find(templates, view, HERE).rows) == 0
+def test_nothing_is_found_in_a_uniform_image(templates, gray):
+    view = GrayFrame(gray=np.full((240, 320), gray, np.uint8), camera=CAMERA, scale=1.0)
+    assert len(find_templates(templates, view, HERE).rows) == 0
 
 
-def test_from_behind_or_far_aside_nothing_is_expected(templates):
+def test_no_template_is_expected_from_behind_or_far_aside(templates):
     for pose in (rigid([0, 0, 0], [0, 0, -3]), rigid([0, 60, 0], [0, 0, 3]), rigid([0, 0, 0], [50, 0, 3])):
-        sighting = find(templates, View(gray=cloth(), camera=CAMERA, scale=1.0), pose)
+        sighting = find_templates(templates, GrayFrame(gray=cloth(), camera=CAMERA, scale=1.0), pose)
         assert (len(sighting.rows), sighting.num_expected) == (0, 0)
 
 
-def test_joining_knows_a_point_once_and_prefers_the_new(templates):
+def test_joining_keeps_one_template_per_point_and_prefers_the_new(templates):
     some, others = templates[np.arange(10)], templates[np.arange(5, 20)]
-    both = joined(some, others, limit=100)
+    both = join_templates(some, others, limit=100)
     assert len(both) == 20
     assert np.array_equal(both.points3D_in_world[:10], some.points3D_in_world)
-    assert len(joined(some, others, limit=12)) == 12
-    assert len(joined(some, others, limit=5)) == 10
+    assert len(join_templates(some, others, limit=12)) == 12
+    assert len(join_templates(some, others, limit=5)) == 10
 
 
 @settings(deadline=None, max_examples=50)
@@ -103,10 +103,10 @@ def test_joining_knows_a_point_once_and_prefers_the_new(templates):
     places=st.lists(st.tuples(st.integers(0, 99), st.integers(0, 99)), max_size=40),
     limit=st.integers(1, 50),
 )
-def test_spreading_serves_every_cell_before_it_serves_one_twice(places, limit):
+def test_every_cell_gets_a_match_before_one_gets_two(places, limit):
     points2D = np.array(places, float).reshape(-1, 2)
     points3D = np.column_stack([np.arange(len(places)) // 2] * 3).astype(float)  # each point is matched twice
-    rows = spread(points2D, points3D, limit, cell_px=25.0)
+    rows = spread_over_cells(points2D, points3D, limit, cell_px=25.0)
     assert np.all(np.diff(rows) > 0)
     assert len(np.unique(points3D[rows], axis=0)) == len(rows) == min(limit, (len(places) + 1) // 2)
     cells = [tuple(cell) for cell in points2D // 25]

@@ -33,18 +33,18 @@ def error(one, truth, box):
 
 @pytest.fixture(scope="module")
 def walked(localizer, walk):
-    """The sequence, tracked."""
+    """Results of tracking the sequence."""
     return tracked(localizer, walk.images)
 
 
-def test_an_object_is_tracked_where_it_is_and_a_cut_is_seen_at_once(localizer, walk, walked):
+def test_object_is_tracked_accurately_and_a_cut_is_noticed_at_once(localizer, walk, walked):
     half = len(walk.images) // 2
     assert states(walked) == 2 * ["localized", *["tracked"] * (half - 1)]
     errors = [error(one, t, localizer.map.box) for one, t in zip(walked, walk.cam_from_world, strict=True)]
     assert max(errors) < 0.03
 
 
-def test_what_is_known_of_a_tracked_frame(walked):
+def test_result_of_a_tracked_frame_is_complete(walked):
     for one in walked:
         assert one.seconds > 0
         assert 0 < one.pose.confidence <= 1
@@ -54,7 +54,7 @@ def test_what_is_known_of_a_tracked_frame(walked):
         assert localization.predicted_corner_error < 0.05
 
 
-def test_equal_frames_give_equal_poses_whatever_the_work_beside_takes(localizer, walk, walked, monkeypatch):
+def test_poses_do_not_depend_on_the_duration_of_background_work(localizer, walk, walked, monkeypatch):
     fast = localizer.localize_near
     delays_s = iter([0.3, 0.0, 0.2, 0.05] * 10)
     calls = []
@@ -69,7 +69,7 @@ def test_equal_frames_give_equal_poses_whatever_the_work_beside_takes(localizer,
     assert len(calls) >= 4
 
 
-def test_a_still_video_stands_still(localizer, walk):
+def test_poses_of_a_still_video_are_still(localizer, walk):
     first, *others = tracked(localizer, 10 * walk.images[:1])
     assert states(others) == 9 * ["tracked"]
     for one in others:
@@ -77,7 +77,7 @@ def test_a_still_video_stands_still(localizer, walk):
     assert error(others[1], others[0].pose.cam_from_world, localizer.map.box) < 1e-3
 
 
-def test_a_small_view_gives_the_poses_of_a_large_frame(localizer, walk):
+def test_tracking_in_shrunk_frames_gives_poses_of_whole_frames(localizer, walk):
     large = [np.asarray(cv2.resize(image, (960, 720)), np.uint8) for image in walk.images[:4]]
     results = tracked(localizer, large, TrackerOptions(max_image_size=320))
     assert states(results) == ["localized", "tracked", "tracked", "tracked"]
@@ -87,7 +87,7 @@ def test_a_small_view_gives_the_poses_of_a_large_frame(localizer, walk):
         assert np.all(errors_px > 320)  # in pixels of the frame
 
 
-def test_black_frames_have_no_pose_and_the_object_is_back_at_once(localizer, walk):
+def test_black_frames_have_no_pose_and_the_object_is_found_again_at_once(localizer, walk):
     images = [*walk.images[:4], BLACK, BLACK, *walk.images[4:7]]
     results = tracked(localizer, images)
     assert states(results) == [
@@ -99,7 +99,7 @@ def test_black_frames_have_no_pose_and_the_object_is_back_at_once(localizer, wal
     assert results[4].num_points == 0
 
 
-def test_what_passes_in_front_does_not_take_the_pose_along(localizer, walk):
+def test_object_passing_in_front_does_not_disturb_the_pose(localizer, walk):
     card = np.random.default_rng(0).integers(0, 256, (30, 20, 3), np.uint8)
     card = np.asarray(cv2.resize(card, (160, 240), interpolation=cv2.INTER_CUBIC), np.uint8)
     images = [walk.images[0].copy() for _ in range(24)]
@@ -114,7 +114,7 @@ def test_what_passes_in_front_does_not_take_the_pose_along(localizer, walk):
     assert results[-1].pose
 
 
-def test_the_less_is_seen_the_less_sure_is_the_pose(localizer, walk):
+def test_confidence_decreases_when_less_is_seen(localizer, walk):
     covered = walk.images[0].copy()
     covered[:, :165] = 90
     whole, part = tracked(localizer, [walk.images[0], covered], TrackerOptions())
@@ -122,26 +122,26 @@ def test_the_less_is_seen_the_less_sure_is_the_pose(localizer, walk):
     assert part.pose.confidence < whole.pose.confidence
 
 
-def test_smoothing_calms_what_is_given_out_and_not_the_tracking(localizer, walk):
+def test_smoothing_changes_the_returned_poses_and_not_the_tracking(localizer, walk):
     noise = np.random.default_rng(0).normal(0, 6, (8, *walk.images[0].shape))
     noisy = np.clip(walk.images[0] + noise, 0, 255).astype(np.uint8)
     raw, calm = (tracked(localizer, noisy, TrackerOptions(smoothing=strength)) for strength in (0.0, 5.0))
-    trembling, calmed = (
+    jitter, calmed = (
         [error(b, a.pose.cam_from_world, localizer.map.box) for a, b in pairwise(results)]
         for results in (raw, calm)
     )
-    assert np.mean(calmed) < np.mean(trembling)
+    assert np.mean(calmed) < np.mean(jitter)
     assert [one.num_points for one in raw] == [one.num_points for one in calm]
 
 
-def test_a_frame_of_another_size_is_localized_anew(localizer, walk):
+def test_frame_of_another_size_is_localized_from_scratch(localizer, walk):
     small = np.asarray(cv2.resize(walk.images[1], (300, 225), interpolation=cv2.INTER_AREA), np.uint8)
     results = tracked(localizer, [walk.images[0], small])
     assert states(results)[0] == "localized"
     assert states(results)[1] in ("localized", "lost")
 
 
-def test_a_camera_of_another_size_is_refused(localizer):
+def test_camera_of_another_size_is_rejected(localizer):
     other = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[600.0, 600.0, 320.0, 240.0])
     with pytest.raises(ValueError, match="size 320x240"):
         Tracker(localizer).track(BLACK, other)
@@ -160,12 +160,12 @@ def test_a_camera_of_another_size_is_refused(localizer):
         ("smoothing", float("nan")),
     ],
 )
-def test_bad_options_are_named(name, value):
+def test_error_names_the_invalid_option(name, value):
     with pytest.raises(ValueError, match=f"{name} must"):
         TrackerOptions(**{name: value})
 
 
-def test_a_localizer_serves_several_trackers_at_a_time(boulder, walk):
+def test_several_trackers_can_share_a_localizer(boulder, walk):
     localizer = Localizer(boulder.map)
     one, other = Tracker(localizer, BUSY), Tracker(localizer, BUSY)
     apart = [matrices(tracked(localizer, images)) for images in (walk.images[:6], walk.images[12:18])]

@@ -8,11 +8,11 @@ from PIL import Image
 
 from commands import contents
 from slimsfm.errors import ImageError, InputError, OutputError
-from slimsfm.tracking.video import FORMATS, open_frames, write_video
+from slimsfm.tracking.video import VIDEO_FORMATS, open_frames, write_video
 
 
 def pictures(count=6, height=120, width=160):
-    """Each of one colour on the left and of one on the right, which compression hardly changes."""
+    """Images of one color on the left and another on the right, which compression hardly changes."""
     made = np.full((count, height, width, 3), 200, np.uint8)
     made[:, :, : width // 2] = (20 + 30 * np.arange(count))[:, None, None, None]
     return made
@@ -24,11 +24,11 @@ def write(path, images, rate=25.0, **options):
             add(image)
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", VIDEO_FORMATS)
 @pytest.mark.parametrize("size", [(120, 160), (121, 161)], ids=str)
-def test_what_is_written_is_read_back(tmp_path, suffix, size):
+def test_written_video_is_read_back(tmp_path, suffix, size):
     path, images = tmp_path / f"film{suffix}", pictures(6, *size)
-    write(path, images)
+    write(str(path), images)
     assert [path.name for path in tmp_path.iterdir()] == [path.name]
     frames = open_frames(str(path))
     assert frames.count in (6, None)
@@ -42,8 +42,8 @@ def test_what_is_written_is_read_back(tmp_path, suffix, size):
         assert np.median(np.abs(frame.image[:height, :width].astype(int) - image)) <= 3
 
 
-def turned_in_its_header(path):
-    """Make a film say that it is to be shown turned to the right, as that of a phone held upright."""
+def rotate_in_header(path):
+    """Set the header to be displayed rotated to the right, like the video of a phone held upright."""
     data = bytearray(path.read_bytes())
     start = data.index(b"tkhd") + 4 + 40
     matrix = [0, 1 << 16, 0, (1 << 32) - (1 << 16), 0, 0, 0, 0, 1 << 30]
@@ -51,19 +51,19 @@ def turned_in_its_header(path):
     path.write_bytes(data)
 
 
-def test_a_film_of_a_phone_held_upright_is_read_upright(tmp_path):
+def test_video_of_a_phone_held_upright_is_read_upright(tmp_path):
     path, images = tmp_path / "film.mp4", pictures(2)
     write(path, images)
-    turned_in_its_header(path)
+    rotate_in_header(path)
     (first, _) = open_frames(str(path)).pictures
     assert first.image.shape == (160, 120, 3)
     assert np.median(np.abs(first.image.astype(int) - np.rot90(images[0], -1))) <= 3
 
 
-def test_a_folder_gives_its_images_in_order(tmp_path):
+def test_images_of_a_folder_are_read_in_order(tmp_path):
     for i, image in enumerate(pictures(3)):
         Image.fromarray(image).save(tmp_path / f"{2 - i}.png")
-    frames = open_frames(str(tmp_path))
+    frames = open_frames(tmp_path)
     assert frames.count == 3
     read = list(frames.pictures)
     assert [frame.name for frame in read] == ["0.png", "1.png", "2.png"]
@@ -71,7 +71,7 @@ def test_a_folder_gives_its_images_in_order(tmp_path):
 
 
 class FakeCamera:
-    """Shows pictures in OpenCV's order of colours."""
+    """Returns images in OpenCV's order of channels."""
 
     released = 0
 
@@ -91,7 +91,7 @@ class FakeCamera:
         FakeCamera.released += 1
 
 
-def test_a_camera_gives_frames_until_it_ends(monkeypatch):
+def test_camera_gives_frames_until_it_ends(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
     frames, released = open_frames("0"), FakeCamera.released
     assert (frames.count, frames.is_live, frames.frames_per_second) == (None, True, 30)
@@ -99,20 +99,20 @@ def test_a_camera_gives_frames_until_it_ends(monkeypatch):
     assert FakeCamera.released == released + 1
 
 
-def test_there_is_no_such_camera(monkeypatch):
+def test_missing_camera_is_an_error(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
     with pytest.raises(InputError, match=r"^7: no camera"):
         open_frames("7")
 
 
-def test_a_file_that_is_called_like_a_camera_is_a_file(tmp_path, monkeypatch):
+def test_file_named_like_a_camera_index_is_read_as_a_file(tmp_path, monkeypatch):
     write(tmp_path / "0.mp4", pictures(2))
     (tmp_path / "0.mp4").rename(tmp_path / "0")
     monkeypatch.chdir(tmp_path)
     assert len(list(open_frames("0").pictures)) == 2
 
 
-def test_what_is_no_video_is_named(tmp_path):
+def test_error_names_a_file_that_is_not_a_video(tmp_path):
     (tmp_path / "text.mp4").write_text("no video")
     (tmp_path / "sound.wav").write_bytes(silence(tmp_path / "silence.wav"))
     write(tmp_path / "whole.mp4", pictures(3))
@@ -122,7 +122,7 @@ def test_what_is_no_video_is_named(tmp_path):
         "missing.mp4": "no such video",
         "text.mp4": "not a readable video",
         "cut.mp4": "not a readable video",
-        "sound.wav": "holds no pictures",
+        "sound.wav": "contains no images",
     }.items():
         with pytest.raises(InputError, match=rf"{name}: {why}"):
             open_frames(str(tmp_path / name))
@@ -139,15 +139,15 @@ def silence(path):
     return path.read_bytes()
 
 
-def test_an_empty_folder_and_a_broken_image_are_named(tmp_path):
-    with pytest.raises(InputError, match="holds no image"):
+def test_error_names_an_empty_folder_and_a_broken_image(tmp_path):
+    with pytest.raises(InputError, match="contains no image"):
         open_frames(str(tmp_path))
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(ImageError, match=r"text\.png"):
         list(open_frames(str(tmp_path)).pictures)
 
 
-def test_a_film_that_is_damaged_inside_is_named(tmp_path, monkeypatch):
+def test_error_names_a_damaged_video(tmp_path, monkeypatch):
     path = tmp_path / "film.mp4"
     write(path, pictures(3))
 
@@ -159,7 +159,7 @@ def test_a_film_that_is_damaged_inside_is_named(tmp_path, monkeypatch):
         list(open_frames(str(path)).pictures)
 
 
-def test_without_pyav_the_user_is_told_what_to_install(tmp_path, monkeypatch):
+def test_error_without_pyav_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "film.mp4").write_text("whatever")
     monkeypatch.setitem(sys.modules, "av", None)
     for use in (
@@ -171,7 +171,7 @@ def test_without_pyav_the_user_is_told_what_to_install(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
-def test_a_video_of_no_known_format_or_that_exists_is_not_written(tmp_path):
+def test_unknown_formats_and_existing_files_are_not_written(tmp_path):
     (tmp_path / "taken.mp4").write_text("mine")
     before = contents(tmp_path)
     with pytest.raises(OutputError, match=r"film\.gif: videos are written as \.mp4"):
@@ -183,7 +183,7 @@ def test_a_video_of_no_known_format_or_that_exists_is_not_written(tmp_path):
     assert len(list(open_frames(str(tmp_path / "taken.mp4")).pictures)) == 1
 
 
-def test_a_video_that_fails_half_way_leaves_nothing(tmp_path):
+def test_failed_video_leaves_no_file(tmp_path):
     def images():
         yield pictures(1)[0]
         raise KeyError("out of film")
@@ -193,7 +193,7 @@ def test_a_video_that_fails_half_way_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_equal_pictures_give_equal_bytes(tmp_path):
+def test_equal_images_give_equal_bytes(tmp_path):
     for name in ("a.mp4", "b.mp4"):
         write(tmp_path / name, pictures())
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()

@@ -21,8 +21,7 @@ from slimsfm.cli.output import (
     parse,
 )
 from slimsfm.errors import InputError
-from slimsfm.execution import num_cores, on_threads
-from slimsfm.gravity import Gravity
+from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
 from slimsfm.localization.cameras import (
     FocalLength,
@@ -35,6 +34,7 @@ from slimsfm.localization.pose_files import write_object_poses, write_poses, wri
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
 from slimsfm.photos import list_images, read_image
+from slimsfm.pose import Gravity
 from slimsfm.progress import shown
 
 Found = dict[str, Localization]
@@ -87,7 +87,7 @@ def localize(
     downwards = read_gravity(gravity) if gravity else {}
     localizers = {name: Localizer(one, localization) for name, one in maps.items()}
     work = partial(_localize, MultiLocalizer(localizers), downwards)
-    run = on_threads(work, queries, workers or num_cores())
+    run = map_on_threads(work, queries, workers or num_cores())
     label = f"localize ({', '.join(sorted({localization.strategy_for(one) for one in maps.values()}))})"
     results = {query.name: next(run) for query in shown(queries, label)}
     by_object = {name: {image: one[name] for image, one in results.items()} for name in maps}

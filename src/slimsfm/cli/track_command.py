@@ -24,7 +24,7 @@ from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
 from slimsfm.report.frames import TRUE_RGB, draw_box
 from slimsfm.tracking import Tracked, Tracker, TrackerOptions
-from slimsfm.tracking.video import Frame, Frames, check_format, open_frames, write_video
+from slimsfm.tracking.video import FrameSource, VideoFrame, check_format, open_frames, write_video
 
 VideoPath = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="VIDEO")]
 
@@ -77,9 +77,9 @@ def track(
 
 
 def _follow(
-    frames: Frames,
+    frames: FrameSource,
     tracker: Tracker,
-    camera_of: Callable[[Frame], pycolmap.Camera],
+    camera_of: Callable[[VideoFrame], pycolmap.Camera],
     box: Box,
     write: Callable[[Image], None] | None,
 ) -> dict[str, Tracked]:
@@ -105,7 +105,7 @@ def _follow(
     return results
 
 
-def _shown(frames: Frames) -> Iterator[Frame]:
+def _shown(frames: FrameSource) -> Iterator[VideoFrame]:
     """The frames, with a bar and their rate on standard error."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
@@ -115,7 +115,7 @@ def _shown(frames: Frames) -> Iterator[Frame]:
             bars.update(task, advance=1, description=f"track {bars.tasks[0].speed or 0:.0f}/s")
 
 
-def _camera(map: Map, source: str, frame: Frame, given: pycolmap.Camera | None) -> pycolmap.Camera:
+def _camera(map: Map, source: str, frame: VideoFrame, given: pycolmap.Camera | None) -> pycolmap.Camera:
     """The intrinsics of all frames, told by the first: given, of the map, or EXIF's."""
     if Path(source).is_dir():
         return query_camera(map, Path(source) / frame.name, given)
@@ -128,7 +128,7 @@ def _camera(map: Map, source: str, frame: Frame, given: pycolmap.Camera | None) 
     return camera
 
 
-def _check_size(frame: Frame, camera: pycolmap.Camera) -> None:
+def _check_size(frame: VideoFrame, camera: pycolmap.Camera) -> None:
     height, width = frame.image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise InputError(

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import pycolmap
 
 from slimsfm.execution import num_cores, on_threads
-from slimsfm.gravity import Gravity
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
 from slimsfm.localization.multi import MultiLocalizer
 from slimsfm.photos import list_images, read_image
+from slimsfm.pose.priors import Gravity
 from slimsfm.progress import ProgressBar, silent
 
 _ONLY = ""  # name of the object where there is one map

@@ -10,13 +10,12 @@ import pycolmap
 from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.features.methods import DETECTOR_FREE, importing, plugins, resolve
-from slimsfm.gravity import Gravity
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.guided_matching import extract_near
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.map import Map
-from slimsfm.pose import PoseEstimate, RansacOptions
+from slimsfm.pose import Gravity, PoseEstimate, RansacOptions
 
 # Paths, not classes: naming a strategy must not import its dependencies.
 STRATEGIES = {

@@ -8,8 +8,8 @@ import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.features import Features
-from slimsfm.gravity import Gravity
 from slimsfm.localization.localizer import Localization, Localizer
+from slimsfm.pose import Gravity
 
 
 class MultiLocalizer:

@@ -8,16 +8,14 @@ from typing import NamedTuple
 import pycolmap
 
 from slimsfm.features import nearest_for
-from slimsfm.focal import estimate_pose_and_focal
 from slimsfm.geometry import project
-from slimsfm.gravity import Gravity, estimate_upright_pose
 from slimsfm.localization.cameras import FocalLength
 from slimsfm.localization.guided_matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
-from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
 
 SURE = 0.95
 """Confidence from which a pose is sure."""
@@ -156,14 +154,10 @@ class Search:
     ) -> "_Posed":
         points2D, points3D = matches.pixels(query), self._map.points3D_in_world[matches.points]
         if self._focal == "known":
-            if gravity is None:
-                return _Posed(estimate_pose(points2D, points3D, camera, self._ransac), camera)
-            return _Posed(estimate_upright_pose(points2D, points3D, camera, gravity, self._ransac), camera)
-        uncertainty = _APPROXIMATE if self._focal == "approximate" else None
-        found = estimate_pose_and_focal(
-            points2D, points3D, camera, self._ransac, relative_uncertainty=uncertainty
-        )
-        return _Posed(found.pose, found.camera) if found else _Posed(None, camera)
+            return _Posed(estimate_pose(points2D, points3D, camera, self._ransac, gravity=gravity), camera)
+        focal = FocalPrior.of(camera, _APPROXIMATE if self._focal == "approximate" else None)
+        pose = estimate_pose(points2D, points3D, camera, self._ransac, focal=focal)
+        return _Posed(pose, camera if pose is None or pose.camera is None else pose.camera)
 
 
 class _Posed(NamedTuple):

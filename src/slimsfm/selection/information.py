@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from slimsfm.arrays import Ids
+from slimsfm.pose import rms_corner_errors
 from slimsfm.selection.lazy import Gains, greedy_order
 from slimsfm.selection.problem import (
     PRIOR_SIGMA,
     SelectionProblem,
     Twists,
     check_count,
-    corner_errors,
     most_cover,
 )
 
@@ -88,7 +88,7 @@ class _Choice:
         self._twists = problem.twists
         self._precision = np.tile(np.eye(6) / PRIOR_SIGMA**2, (problem.num_images, 1, 1))
         self._covariance = np.tile(np.eye(6) * PRIOR_SIGMA**2, (problem.num_images, 1, 1))
-        self._error = corner_errors(self._covariance, problem.corner_twists)
+        self._error = rms_corner_errors(self._covariance, problem.corner_twists)
         self._seen = np.zeros(problem.num_images, np.int64)
         self._free = np.ones(problem.num_points, bool)
 
@@ -115,7 +115,7 @@ class _Choice:
         self._seen[images] += 1
         self._precision[images] += twists.transpose(0, 2, 1) @ twists
         self._covariance[images] = np.linalg.inv(self._precision[images])
-        self._error[images] = corner_errors(self._covariance[images], self._problem.corner_twists[images])
+        self._error[images] = rms_corner_errors(self._covariance[images], self._problem.corner_twists[images])
         self._open[images] = (self._seen[images] < self._needed[images]) | (
             self._error[images] > self._target[images]
         )

@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
 from slimsfm.arrays import Ids
+from slimsfm.pose import rms_corner_errors
 
 Twists = Float32[np.ndarray, "n 2 6"]
 """Pixels by which a point's image moves per unit of a camera's motion: rotation in radians, then translation
@@ -91,7 +92,7 @@ class SelectionProblem:
 
     def corner_errors(self, points: Ids | None = None) -> Float64[np.ndarray, " images"]:
         """Predicted corner error of each image's pose from the chosen points (None: all) it can use."""
-        return corner_errors(np.linalg.inv(self.information(points)), self.corner_twists)
+        return rms_corner_errors(np.linalg.inv(self.information(points)), self.corner_twists)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -135,14 +136,6 @@ class Selector(Protocol):
             any more of them.
         """
         ...
-
-
-def corner_errors(
-    covariances: Float64[np.ndarray, "n 6 6"], corner_twists: Float32[np.ndarray, "n 24 6"]
-) -> Float64[np.ndarray, " n"]:
-    """Root mean square displacement of the box's corners, in diagonals, for poses of these covariances."""
-    squares = np.einsum("nca,nca->n", corner_twists @ covariances, corner_twists)
-    return np.sqrt(squares / 8)
 
 
 def check_count(count: int) -> None:

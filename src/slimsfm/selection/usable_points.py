@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
-from slimsfm.arrays import Ids, Points3D
+from slimsfm.arrays import Ids
 from slimsfm.features import match_nearest
 from slimsfm.geometry import motions, reprojection_errors
 from slimsfm.mapping.map import Map, observed
+from slimsfm.pose import projection_jacobian
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem, Twists
@@ -76,18 +77,16 @@ def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.nda
 def _twists(map: Map, name: str, points: Ids) -> Twists:
     """Of an ideal pinhole camera: lens distortion changes little of what a match says of the pose."""
     in_cam = map.images[name].cam_from_world() * map.points3D_in_world[points]
-    x, y, z = in_cam.T
-    zero = np.zeros_like(z)
-    in_pixels = np.stack([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(2, 0, 1)
-    twists = map.camera(name).mean_focal_length() * in_pixels @ _motions(in_cam, map.box.diagonal)
-    return twists.astype(np.float32)
+    twists = projection_jacobian(in_cam, map.camera(name).mean_focal_length())
+    return (twists * _in_diagonals(map.box.diagonal)).astype(np.float32)
 
 
 def _corner_twists(map: Map, name: str) -> Float32[np.ndarray, "24 6"]:
     in_cam = map.images[name].cam_from_world() * map.box.corners
-    return (_motions(in_cam, map.box.diagonal) / map.box.diagonal).reshape(24, 6).astype(np.float32)
+    twists = motions(in_cam) * _in_diagonals(map.box.diagonal)
+    return (twists / map.box.diagonal).reshape(24, 6).astype(np.float32)
 
 
-def _motions(in_cam: Points3D, diagonal: float) -> Float64[np.ndarray, "n 3 6"]:
-    """How points move in the camera's frame when it turns (radians) and shifts (diagonals)."""
-    return motions(in_cam) * np.array([1, 1, 1, diagonal, diagonal, diagonal])
+def _in_diagonals(diagonal: float) -> Float64[np.ndarray, "6"]:
+    """Factors that turn a derivative by shifts in map units into one by shifts in diagonals."""
+    return np.array([1, 1, 1, diagonal, diagonal, diagonal])

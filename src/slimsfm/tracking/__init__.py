@@ -1,4 +1,4 @@
-"""Following an object through a video."""
+"""Track an object through a video."""
 
 from slimsfm.tracking.tracker import Tracked, Tracker, TrackerOptions
 

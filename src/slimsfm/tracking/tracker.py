@@ -11,49 +11,48 @@ from slimsfm.arrays import Image, Points2D
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
-from slimsfm.tracking.ambiguity import is_ambiguous
-from slimsfm.tracking.background import Renewal, Renewed
-from slimsfm.tracking.gray_frame import View, view_of
-from slimsfm.tracking.motion import smoothed
-from slimsfm.tracking.relocalization import Recovery
-from slimsfm.tracking.templates import Templates, cut_out, joined, spread
-from slimsfm.tracking.track import Track, begun, follow
+from slimsfm.tracking.background import BackgroundLocalization, BackgroundResult
+from slimsfm.tracking.gray_frame import GrayFrame, to_gray_frame
+from slimsfm.tracking.relocalization import Relocalizer, is_ambiguous
+from slimsfm.tracking.templates import Templates, cut_templates, join_templates, spread_over_cells
+from slimsfm.tracking.track import Track, begin_track, follow_track, smoothed_pose
 
 State = Literal["tracked", "localized", "lost"]
 
-_CELL = 1 / 40  # side of a cell that matches are spread over, of the image's longer side
-_SURE_SHARE = 0.5  # of the points that should be in sight, seen: does not lower the confidence
+_CELL = 1 / 40  # side of a cell that matches are spread over, relative to the image's longer side
+_SURE_SHARE = 0.5  # of the points expected in sight; as long as these are seen, the confidence stays
 _DOUBT = 0.3  # confidence at which a track is given up
-_CONTRADICTION = 0.1  # corner error, over the diagonal, at which tracking and localization speak of two poses
+_CONTRADICTION = 0.1  # corner error, over the diagonal, at which localization contradicts the track
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackerOptions:
-    """How an object is followed."""
+    """How an object is tracked."""
 
     max_points: int = 250
-    """Most points of the map that are followed."""
+    """Largest number of map points to track."""
 
     max_image_size: int = 640
-    """Track in frames shrunk so that their longer side has this many pixels; localize in whole ones."""
+    """Longer side, in pixels, to which frames are shrunk for tracking. Localization uses whole frames."""
 
     renew_every: int = 20
-    """After at most so many frames one is localized anew beside the tracking."""
+    """Largest number of frames between localizations in the background of tracking."""
 
     lag: int = 5
-    """Frames after which what was found beside is taken over: always as many, however fast the machine is, so
-    that the poses depend on the frames alone."""
+    """Number of frames after which the result of a background localization is used. It is constant however
+    fast the machine is, so that the poses depend on the frames alone."""
 
     begin_confidence: float = 0.8
-    """A track begins with a pose at least this sure: where nothing is in sight, many frames are searched, and
-    one false pose in them is one too many."""
+    """Smallest confidence of a pose that begins a track. While the object is out of sight, many frames are
+    searched, and a single false pose among them would begin a false track."""
 
     search_every: int = 8
-    """While the object is out of sight, a whole frame is searched at least as often as this, and the others
-    only where it was seen last. 1: every frame, which is slow."""
+    """Largest number of frames between searches of a whole frame while the object is out of sight. Other
+    frames are searched only where it was last seen. 1 searches every whole frame, which is slow."""
 
     smoothing: float = 0.0
-    """Frames over which the poses of a still camera are smoothed; fast motion stays as it is. 0: none."""
+    """Number of frames over which poses of a still camera are smoothed; fast motion is not smoothed. 0: no
+    smoothing."""
 
     def __post_init__(self) -> None:
         if self.max_image_size < 64:
@@ -69,109 +68,109 @@ class TrackerOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracked:
-    """What became of one frame."""
+    """Result of tracking one frame."""
 
     localization: Localization
-    """The pose and the matches that it rests on. All time of a tracked frame counts as matching."""
+    """The pose and the matches that support it. All time of a tracked frame counts as matching."""
 
     state: State
-    """Tracked from the frame before; localized on its own; or lost, which not even that could help."""
+    """Tracked from the frame before; localized without a track; or lost, where localization failed too."""
 
     seconds: float
-    """Time it took, from the decoded frame to the pose."""
+    """Time from the decoded frame to the pose."""
 
     @property
     def pose(self) -> PoseEstimate | None:
-        """Where the camera stood; None where the object is out of sight.
+        """Pose of the camera; None where the object was not found.
 
-        The confidence of a tracked pose is that of the localization that its track goes back to; where fewer
-        than half of the points are seen that should be in sight, it is lower in proportion. Each localization
-        beside the tracking that finds nothing halves it, and where little is left the track is given up.
+        The confidence of a tracked pose is that of the localization its track goes back to. Where fewer than
+        half of the points expected in sight are seen, it is reduced in proportion. Each background
+        localization without a pose halves it, and a track of little confidence is given up.
         """
         return self.localization.pose
 
     @property
     def num_points(self) -> int:
-        """Points of the map that the pose rests on."""
+        """Number of map points that support the pose."""
         return self.pose.num_inliers if self.pose else 0
 
 
 class Tracker:
-    """Follows one object through the frames of a video; equal frames give equal poses.
+    """Tracks one object through the frames of a video; equal frames give equal poses.
 
-    Where the object is in sight, each frame is followed from the one before, and now and then one is
-    localized on another thread. Where it is lost, the frame is localized at once. The localizer must take the
-    focal length as known.
+    While the object is in sight, each frame is tracked from the one before, and now and then a frame is
+    localized on another thread. When the object is lost, frames are localized at once. The localizer must
+    treat the focal length as known.
     """
 
     def __init__(self, localizer: Localizer, options: TrackerOptions = TrackerOptions()) -> None:
         self._localizer = localizer
         self._options = options
         self._box = localizer.map.box
-        self._renewal = Renewal(self._box.center, options.renew_every, options.lag)
-        self._recovery = Recovery(localizer, options.search_every, options.begin_confidence)
+        self._background = BackgroundLocalization(self._box.center, options.renew_every, options.lag)
+        self._relocalizer = Relocalizer(localizer, options.search_every, options.begin_confidence)
         self._track: Track | None = None
         self._confidence: float | None = None
-        self._given_cam_from_world: pycolmap.Rigid3d | None = None
-        self._frame = -1
+        self._smoothed_cam_from_world: pycolmap.Rigid3d | None = None
+        self._frame_index = -1
 
     def track(self, image: Image, camera: pycolmap.Camera | None = None) -> Tracked:
-        """Find where the camera stood in the next frame.
+        """Find the pose of the camera in the next frame.
 
         Args:
             image: Upright RGB.
-            camera: Its intrinsics; those of the map where all reference images share a camera and the sizes
-                agree up to a common scale.
+            camera: Intrinsics of the frame; by default those of the map, if all reference images share a
+                camera and the sizes agree up to a common scale.
 
         Raises:
-            ValueError: No camera is given and the map's cannot stand in, or it is of another size.
+            ValueError: No camera is given and the map's cannot be used, or the camera has another size.
         """
         start = perf_counter()
-        self._frame += 1
+        self._frame_index += 1
         camera = self._localizer.camera_of(image, camera)
-        view = view_of(image, camera, self._options.max_image_size)
-        track = self._followed(view)
+        frame = to_gray_frame(image, camera, self._options.max_image_size)
+        track = self._followed(frame)
         if track:
             near = track.pose.cam_from_world
-            # a copy: the caller may put the next frame into the same memory
-            beside = partial(self._localizer.localize_near, image.copy(), camera, near)
-            self._renewal.begin_if_wanted(self._frame, track, beside)
+            # copy, because the caller may reuse the memory for the next frame
+            localize = partial(self._localizer.localize_near, image.copy(), camera, near)
+            self._background.start_if_due(self._frame_index, track, localize)
             state, localization = "tracked", self._as_localization(track, camera, perf_counter() - start)
         else:
             if self._track:
-                self._recovery.lost(self._frame, self._track.pose.cam_from_world)
-            localization = self._unambiguous(self._recovery.seek(self._frame, image, camera))
-            track = self._begun(localization, view)
+                self._relocalizer.mark_lost(self._frame_index, self._track.pose.cam_from_world)
+            localization = self._unambiguous(self._relocalizer.localize(self._frame_index, image, camera))
+            track = self._begun(localization, frame)
             state = "localized" if track else "lost"
             if track:
-                self._renewal.restart(self._frame, track)
+                self._background.restart(self._frame_index, track)
         self._track = track
         return Tracked(localization=self._smoothed(localization), state=state, seconds=perf_counter() - start)
 
-    def _followed(self, view: View) -> Track | None:
-        """The track in the next frame, its templates renewed where that is due; None where it is lost."""
+    def _followed(self, frame: GrayFrame) -> Track | None:
+        """The track in the next frame, with new templates if a background result is due; None if lost."""
         track = self._track
-        if track is None or track.view.gray.shape != view.gray.shape:
+        if track is None or track.frame.gray.shape != frame.gray.shape:
             return None
-        renewed = self._renewal.due(self._frame)
-        templates = self._renewed(track, renewed) if renewed else track.templates
-        return follow(track, templates, view, self._box) if templates else None
+        result = self._background.result_for(self._frame_index)
+        templates = self._updated_templates(track, result) if result else track.templates
+        return follow_track(track, templates, frame, self._box) if templates else None
 
-    def _renewed(self, track: Track, renewed: Renewed) -> Templates | None:
-        """Templates that take in what was found beside; None where that speaks against the track."""
-        pose = renewed.localization.pose
+    def _updated_templates(self, track: Track, result: BackgroundResult) -> Templates | None:
+        """Templates including those of a background result; None where it contradicts the track."""
+        pose = result.localization.pose
         if pose is None:
             self._confidence = None if self._confidence is None else self._confidence / 2
             doubtful = self._confidence is not None and self._confidence < _DOUBT
             return None if doubtful else track.templates
-        if corner_error(pose.cam_from_world, renewed.tracked_cam_from_world, self._box) > _CONTRADICTION:
-            return track.templates if self._is_ambiguous(renewed.localization, pose) else None
+        if corner_error(pose.cam_from_world, result.tracked_cam_from_world, self._box) > _CONTRADICTION:
+            return track.templates if self._is_ambiguous(result.localization, pose) else None
         self._confidence = pose.confidence
-        _, new = self._templates(renewed.localization, pose, renewed.view)
-        return joined(new, track.templates, self._options.max_points)
+        _, new = self._templates(result.localization, pose, result.frame)
+        return join_templates(new, track.templates, self._options.max_points)
 
     def _unambiguous(self, found: Localization) -> Localization:
-        """What was found, without its pose where that is but one of two."""
+        """The localization, without its pose if that is only one of two."""
         if found.pose and self._is_ambiguous(found, found.pose):
             return replace(found, pose=None, predicted_corner_error=None)
         return found
@@ -180,23 +179,24 @@ class Tracker:
         points2D, points3D = found.points2D[pose.inliers], found.points3D_in_world[pose.inliers]
         return is_ambiguous(points2D, points3D, pose.cam_from_world, found.camera, self._box)
 
-    def _begun(self, localization: Localization, view: View) -> Track | None:
-        """The track of a frame that was localized on its own; None where it was not."""
+    def _begun(self, localization: Localization, frame: GrayFrame) -> Track | None:
+        """The track that begins with a localized frame; None where the localization has no pose."""
         pose = localization.pose
         if pose is None:
             return None
-        points2D, templates = self._templates(localization, pose, view)
+        points2D, templates = self._templates(localization, pose, frame)
         self._confidence = pose.confidence
-        return begun(templates, points2D, view, pose)
+        return begin_track(templates, points2D, frame, pose)
 
     def _templates(
-        self, localization: Localization, pose: PoseEstimate, view: View
+        self, localization: Localization, pose: PoseEstimate, frame: GrayFrame
     ) -> tuple[Points2D, Templates]:
-        """Inliers of a localization, spread over the image: where they are in the view, and their looks."""
-        points2D = localization.points2D[pose.inliers] * view.scale
+        """Pixels and templates of inliers of a localization, spread over the frame."""
+        points2D = localization.points2D[pose.inliers] * frame.scale
         points3D = localization.points3D_in_world[pose.inliers]
-        rows = spread(points2D, points3D, self._options.max_points, _CELL * max(view.gray.shape))
-        return points2D[rows], cut_out(view, points2D[rows], points3D[rows], pose.cam_from_world)
+        cell_px = _CELL * max(frame.gray.shape)
+        rows = spread_over_cells(points2D, points3D, self._options.max_points, cell_px)
+        return points2D[rows], cut_templates(frame, points2D[rows], points3D[rows], pose.cam_from_world)
 
     def _as_localization(self, track: Track, camera: pycolmap.Camera, seconds: float) -> Localization:
         seen, confidence = track.seen, self._confidence
@@ -205,7 +205,7 @@ class Tracker:
         return Localization(
             pose=replace(track.pose, confidence=confidence),
             camera=camera,
-            points2D=seen.points2D / track.view.scale,
+            points2D=seen.points2D / track.frame.scale,
             points3D_in_world=track.templates.points3D_in_world[seen.rows],
             references=0,
             predicted_corner_error=track.pose.predicted_corner_error(self._box),
@@ -213,10 +213,10 @@ class Tracker:
         )
 
     def _smoothed(self, localization: Localization) -> Localization:
-        """What is given out of what was found."""
-        pose, last = localization.pose, self._given_cam_from_world
+        """The localization to return, with its pose smoothed."""
+        pose, last = localization.pose, self._smoothed_cam_from_world
         if pose and last and self._options.smoothing:
-            given = smoothed(pose.cam_from_world, last, self._box, self._options.smoothing)
-            localization = replace(localization, pose=replace(pose, cam_from_world=given))
-        self._given_cam_from_world = localization.pose and localization.pose.cam_from_world
+            smoothed = smoothed_pose(pose.cam_from_world, last, self._box, self._options.smoothing)
+            localization = replace(localization, pose=replace(pose, cam_from_world=smoothed))
+        self._smoothed_cam_from_world = localization.pose and localization.pose.cam_from_world
         return localization

@@ -1,4 +1,4 @@
-"""Frames from a video, a folder of images or a camera, and back into a video.
+"""Read frames from a video, a folder of images or a camera, and write frames to a video.
 
 Videos need PyAV, which the extra `video` installs.
 """
@@ -18,64 +18,64 @@ from slimsfm.errors import InputError, OutputError
 from slimsfm.files import replacing
 from slimsfm.photos import list_images, read_image
 
-FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
-"""Videos that can be written, by suffix."""
+VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""Container formats of the videos that can be written, by suffix."""
 
-_USUAL_RATE = 30.0  # frames a second, where nobody tells
+_DEFAULT_RATE = 30.0  # frames per second, where the source does not say
 _QUALITY = {"crf": "20", "preset": "veryfast"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """One picture of several."""
+class VideoFrame:
+    """One frame of a video, a folder or a camera."""
 
     name: str
-    """Its index, or the name of its file."""
+    """Index of the frame with six digits, or the name of its file."""
 
     image: Image
     """Upright RGB."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frames:
+class FrameSource:
     """Frames in the order in which they were taken."""
 
-    pictures: Generator[Frame]
-    """The frames; closed, it lets go of the file or camera."""
+    pictures: Generator[VideoFrame]
+    """Generator of the frames; closing it releases the file or camera."""
 
     count: int | None
-    """How many there are; None where that is not known beforehand."""
+    """Number of frames; None where it is not known in advance."""
 
     frames_per_second: float
-    """At which they were taken; 30 where that is unknown."""
+    """Frame rate of the source; 30 where it is unknown."""
 
     is_live: bool
-    """Whether they come from a camera and go on until somebody stops them."""
+    """Whether the frames come from a camera and continue until stopped."""
 
 
-def open_frames(source: str) -> Frames:
+def open_frames(source: str | Path) -> FrameSource:
     """Open a video file, a folder of images, or a camera by its index.
 
     Raises:
-        InputError: There is no such file, folder or camera, or it holds no picture.
+        InputError: The file, folder or camera does not exist or contains no image.
     """
-    path = Path(source)
+    source, path = str(source), Path(source)
     if path.is_dir():
         names = list_images(path)
-        return Frames(
-            pictures=_images(path, names), count=len(names), frames_per_second=_USUAL_RATE, is_live=False
+        return FrameSource(
+            pictures=_images(path, names), count=len(names), frames_per_second=_DEFAULT_RATE, is_live=False
         )
     if source.isdigit() and not path.exists():
         return _open_camera(int(source))
     return _open_video(path)
 
 
-def _images(folder: Path, names: list[str]) -> Generator[Frame]:
+def _images(folder: Path, names: list[str]) -> Generator[VideoFrame]:
     for name in names:
-        yield Frame(name=name, image=read_image(folder / name))
+        yield VideoFrame(name=name, image=read_image(folder / name))
 
 
-def _open_camera(index: int) -> Frames:
+def _open_camera(index: int) -> FrameSource:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -83,30 +83,32 @@ def _open_camera(index: int) -> Frames:
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
-        raise InputError(f"{index}: no camera of this index can be opened, and there is no such file")
+        raise InputError(f"{index}: no camera with this index can be opened, and no such file exists")
     rate = capture.get(cv2.CAP_PROP_FPS)
-    return Frames(
+    return FrameSource(
         pictures=_captured(capture),
         count=None,
-        frames_per_second=rate if rate > 0 else _USUAL_RATE,
+        frames_per_second=rate if rate > 0 else _DEFAULT_RATE,
         is_live=True,
     )
 
 
-def _captured(capture) -> Generator[Frame]:
+def _captured(capture) -> Generator[VideoFrame]:
     try:
         index = 0
         while True:
-            there, bgr = capture.read()
-            if not there:
+            ok, bgr = capture.read()
+            if not ok:
                 return
-            yield Frame(name=_name(index), image=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8))
+            yield VideoFrame(
+                name=_name(index), image=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+            )
             index += 1
     finally:
         capture.release()
 
 
-def _open_video(path: Path) -> Frames:
+def _open_video(path: Path) -> FrameSource:
     av = _av()
     try:
         container = av.open(str(path))
@@ -116,24 +118,24 @@ def _open_video(path: Path) -> Frames:
         raise InputError(f"{path}: not a readable video") from error
     if not container.streams.video:
         container.close()
-        raise InputError(f"{path}: holds no pictures")
+        raise InputError(f"{path}: contains no images")
     stream = container.streams.video[0]
-    return Frames(
+    return FrameSource(
         pictures=_decoded(path, container),
         count=stream.frames or None,
-        frames_per_second=float(stream.average_rate or _USUAL_RATE),
+        frames_per_second=float(stream.average_rate or _DEFAULT_RATE),
         is_live=False,
     )
 
 
-def _decoded(path: Path, container) -> Generator[Frame]:
+def _decoded(path: Path, container) -> Generator[VideoFrame]:
     with container:
         stream, index = container.streams.video[0], 0
         stream.thread_type = "AUTO"
         try:
             for index, frame in enumerate(container.decode(stream)):
                 image = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
-                yield Frame(name=_name(index), image=np.ascontiguousarray(image))
+                yield VideoFrame(name=_name(index), image=np.ascontiguousarray(image))
         except _av().error.FFmpegError as error:
             raise InputError(f"{path}: cannot be decoded beyond frame {index}") from error
 
@@ -142,32 +144,33 @@ def _name(index: int) -> str:
     return f"{index:06d}"
 
 
-def check_format(path: Path) -> None:
-    """Refuse, before any work is done, a video that cannot be written.
+def check_format(path: str | Path) -> None:
+    """Check, before any work is done, that a video can be written.
 
     Raises:
-        OutputError: The suffix is of no format that can be written.
+        OutputError: The suffix is not that of a format that can be written.
         InputError: PyAV is not installed.
     """
-    if path.suffix not in FORMATS:
-        raise OutputError(f"{path}: videos are written as {', '.join(FORMATS)}")
+    if Path(path).suffix not in VIDEO_FORMATS:
+        raise OutputError(f"{path}: videos are written as {', '.join(VIDEO_FORMATS)}")
     _av()
 
 
 @contextmanager
 def write_video(
-    path: Path, frames_per_second: float, *, overwrite: bool = False
+    path: str | Path, frames_per_second: float, *, overwrite: bool = False
 ) -> Iterator[Callable[[Image], None]]:
-    """Write pictures of one size, RGB, as a video (H.264); call what is given with one after the other.
+    """Write RGB images of one size as a video (H.264): yields a function to call with each image in turn.
 
     Raises:
-        OutputError: The suffix is of no format that can be written, or the file cannot be.
+        OutputError: The suffix is not that of a format that can be written, or the file cannot be written.
         InputError: PyAV is not installed.
     """
     check_format(path)
+    path = Path(path)
     with (
         replacing(path, overwrite=overwrite) as partial,
-        _av().open(str(partial), "w", format=FORMATS[path.suffix]) as container,
+        _av().open(str(partial), "w", format=VIDEO_FORMATS[path.suffix]) as container,
     ):
         stream = None
 

@@ -1,4 +1,4 @@
-"""When whole frames are searched, counted with a localizer that finds what it is told to."""
+"""The schedule of searches, counted with a localizer that returns a given result."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scenes import camera, poses
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking import Tracker, TrackerOptions
-from slimsfm.tracking.relocalization import Recovery
+from slimsfm.tracking.relocalization import Relocalizer
 
 BLACK = np.zeros((480, 640, 3), np.uint8)
 CAMERA = camera()
@@ -26,8 +26,8 @@ def found(confidence):
     )
 
 
-class Finds(Localizer):
-    """Gives every frame a pose of this confidence, or none, and remembers where it was asked to look."""
+class FakeLocalizer(Localizer):
+    """Returns a pose of this confidence, or none, for every frame, and records where it searched."""
 
     def __init__(self, confidence=None):
         self.confidence, self.frame, self.whole, self.near = confidence, 0, [], []
@@ -41,10 +41,10 @@ class Finds(Localizer):
         return found(self.confidence)
 
 
-def sought(localizer, recovery, frames):
+def localized(localizer, relocalizer, frames):
     results = []
     for localizer.frame in frames:
-        results.append(recovery.seek(localizer.frame, BLACK, CAMERA))
+        results.append(relocalizer.localize(localizer.frame, BLACK, CAMERA))
     return results
 
 
@@ -52,43 +52,43 @@ def sought(localizer, recovery, frames):
     ("longest", "whole"),
     [(8, [0, 1, 3, 7, 15, 23, 31, 39]), (3, [0, 1, 3, 6, 9, 12, 15, 18]), (1, list(range(8)))],
 )
-def test_whole_frames_are_searched_at_once_and_then_ever_more_rarely(longest, whole):
-    localizer = Finds()
-    recovery = Recovery(localizer, longest, 0.8)
-    recovery.lost(0, LAST)
-    sought(localizer, recovery, range(whole[-1] + 1))
+def test_whole_frames_are_searched_at_once_and_then_after_ever_longer_pauses(longest, whole):
+    localizer = FakeLocalizer()
+    relocalizer = Relocalizer(localizer, longest, 0.8)
+    relocalizer.mark_lost(0, LAST)
+    localized(localizer, relocalizer, range(whole[-1] + 1))
     assert localizer.whole == whole
     assert len(localizer.near) == whole[-1] + 1 - len(whole)
     assert all(near is LAST for near in localizer.near)
 
 
-def test_what_was_never_seen_is_not_sought_nearby():
-    localizer = Finds()
-    results = sought(localizer, Recovery(localizer, 8, 0.8), range(20))
+def test_object_that_was_never_seen_is_not_searched_for_near_a_pose():
+    localizer = FakeLocalizer()
+    results = localized(localizer, Relocalizer(localizer, 8, 0.8), range(20))
     assert localizer.whole == [0, 1, 3, 7, 15]
     assert not localizer.near
     assert not any(one.pose for one in results)
 
 
-def test_what_is_lost_again_is_searched_for_at_once():
-    localizer = Finds()
-    recovery = Recovery(localizer, 8, 0.8)
-    sought(localizer, recovery, range(20))
-    recovery.lost(20, LAST)
-    sought(localizer, recovery, range(20, 24))
+def test_object_that_is_lost_again_is_searched_for_at_once():
+    localizer = FakeLocalizer()
+    relocalizer = Relocalizer(localizer, 8, 0.8)
+    localized(localizer, relocalizer, range(20))
+    relocalizer.mark_lost(20, LAST)
+    localized(localizer, relocalizer, range(20, 24))
     assert localizer.whole[-3:] == [20, 21, 23]
 
 
-@pytest.mark.parametrize(("confidence", "believed"), [(0.79, False), (0.8, True), (None, False)])
-def test_a_pose_that_is_not_sure_is_not_believed(confidence, believed):
-    localizer = Finds(confidence)
-    recovery = Recovery(localizer, 8, 0.8)
-    recovery.lost(0, LAST)
-    assert [one.pose is not None for one in sought(localizer, recovery, range(4))] == 4 * [believed]
+@pytest.mark.parametrize(("confidence", "accepted"), [(0.79, False), (0.8, True), (None, False)])
+def test_pose_of_low_confidence_is_rejected(confidence, accepted):
+    localizer = FakeLocalizer(confidence)
+    relocalizer = Relocalizer(localizer, 8, 0.8)
+    relocalizer.mark_lost(0, LAST)
+    assert [one.pose is not None for one in localized(localizer, relocalizer, range(4))] == 4 * [accepted]
     assert len(localizer.near) == 1
 
 
-def test_a_track_that_nothing_beside_bears_out_is_given_up(localizer, walk, monkeypatch):
+def test_track_that_background_localization_never_confirms_is_given_up(localizer, walk, monkeypatch):
     monkeypatch.setattr(localizer, "localize_near", lambda *_: found(None))
     tracker = Tracker(localizer, TrackerOptions(renew_every=4, lag=2))
     results = [tracker.track(image) for image in 14 * walk.images[:1]]
