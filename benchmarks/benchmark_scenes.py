@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slimsfm.cli.output import quiet
-from slimsfm.datasets.base import Making
-from slimsfm.datasets.images import Images
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import LoadOptions, map_object
 from slimsfm.datasets.onepose import read_object
+from slimsfm.datasets.reconstructed import Images
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
-from slimsfm.evaluation.protocol import PreparedQuery, prepare, queries_of
+from slimsfm.evaluation.protocol import PreparedQuery, prepare_queries, queries_of
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
@@ -31,14 +30,16 @@ def scenes(folders: list[Path], objects: Sequence[str], output: Path) -> Iterato
     """The folders of photos, then the rendered objects; what is made is kept in the output folder."""
     for folder in folders:
         with quiet():
-            making = Making(folder=output / folder.name, progress=shown)
+            making = LoadOptions(folder=output / folder.name, progress=shown)
             photos = Images(path=folder).load(folder.resolve().name, making)
             made = map_object(photos, output / "workspace")
         queries = queries_of(photos.query)
         write_map(made, output / f"{folder.name}-map", overwrite=True)
         references = read_map(output / f"{folder.name}-map")
         size = bytes_by_part(output / f"{folder.name}-map")["total"]
-        yield Scene(name=folder.name, references=references, bytes=size, queries=prepare(references, queries))
+        yield Scene(
+            name=folder.name, references=references, bytes=size, queries=prepare_queries(references, queries)
+        )
     for name in objects:
         yield rendered(name, output)
 
@@ -54,4 +55,4 @@ def rendered(name: str, output: Path) -> Scene:
     references = read_map(output / f"{name}-map")
     queries = queries_of(made.query)
     size = bytes_by_part(output / f"{name}-map")["total"]
-    return Scene(name=name, references=references, bytes=size, queries=prepare(references, queries))
+    return Scene(name=name, references=references, bytes=size, queries=prepare_queries(references, queries))

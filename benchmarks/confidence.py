@@ -15,10 +15,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from benchmark_scenes import Scene, scenes
-from deceptive_scenes import deceptions
 from scipy.optimize import minimize
 
+from benchmark_scenes import Scene, scenes
+from deceptive_scenes import deceptions
 from slimsfm.evaluation.protocol import PreparedQuery
 from slimsfm.geometry import corner_error
 from slimsfm.localization import LocalizationOptions, Localizer

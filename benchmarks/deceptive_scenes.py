@@ -14,20 +14,20 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
-from benchmark_scenes import Scene
 from PIL import Image as PilImage
 
+from benchmark_scenes import Scene
+from deception import DECEPTIONS
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
-from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import evaluate, prepare, queries_of
+from slimsfm.datasets.base import map_object
+from slimsfm.evaluation.protocol import evaluate, prepare_queries, queries_of
 from slimsfm.evaluation.scores import score
 from slimsfm.execution import processes
 from slimsfm.files import replacing
 from slimsfm.mapping import read_map, write_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
-from slimsfm.synthetic.deception import DECEPTIONS
 from slimsfm.synthetic.scene import Take, object_box
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 0
@@ -53,7 +53,7 @@ def deception(name: str, output: Path, *, workers: int = 1) -> Scene:
         with quiet(), tempfile.TemporaryDirectory() as workspace:
             write_map(map_object(made, Path(workspace), progress=shown), path)
     references = read_map(path)
-    queries = prepare(references, queries_of(made.query))
+    queries = prepare_queries(references, queries_of(made.query))
     return Scene(name=name, references=references, bytes=bytes_by_part(path)["total"], queries=queries)
 
 

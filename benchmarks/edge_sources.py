@@ -11,11 +11,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from benchmark_scenes import Scene, scenes
 
+from benchmark_scenes import Scene, scenes
 from slimsfm.domination import DominationProblem, exact
-from slimsfm.evaluation.metrics import add_percent
 from slimsfm.evaluation.protocol import evaluate
+from slimsfm.evaluation.scores import add_percent
 from slimsfm.graph import GraphOptions, GraphRun, compute_graph
 from slimsfm.graph.candidates import all_pairs, likely_pairs
 from slimsfm.mapping import Map, keep_images

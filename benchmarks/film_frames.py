@@ -13,14 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from deceptive_scenes import run_all
 from jaxtyping import Float64
 from PIL import Image as PilImage
 
+from deceptive_scenes import run_all
+from film import Film, film
 from slimsfm.datasets import onepose
 from slimsfm.datasets.base import PosedSequence
 from slimsfm.files import replacing
-from slimsfm.synthetic.film import Film, film
 
 NAME, FRAMES, WIDTH, HEIGHT, SEED = "printed_box", 600, 640, 480, 0
 

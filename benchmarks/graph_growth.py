@@ -17,10 +17,10 @@ from time import perf_counter
 
 import numpy as np
 
+from city import CityOptions, city_map
 from slimsfm.files import remove
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.mapping import read_map, write_map
-from slimsfm.synthetic.city import CityOptions, city_map
 
 
 def main() -> None:

@@ -16,8 +16,8 @@ from time import perf_counter, process_time
 import cv2
 import numpy as np
 import torch
-from random_weights import write_random_weights
 
+from random_weights import write_random_weights
 from slimsfm.features import Features, load_extractor, load_matcher, unit_rows
 from slimsfm.features.exporting import export_method
 from slimsfm.networks.devices import DEVICE
@@ -43,7 +43,7 @@ def main() -> None:
     arguments = parser.parse_args()
     os.environ[DEVICE] = "cpu"
     torch.set_num_threads(arguments.threads)
-    folders = prepare(arguments.output, arguments.weights)
+    folders = prepare_queries(arguments.output, arguments.weights)
     print(f"{arguments.threads} threads, {SIZE[0]} x {SIZE[1]} pixels; ms by the clock and of the processor")
     print(f"{'':24}{'PyTorch':>16}{'onnxruntime':>16}   ratio")
     image = picture()
@@ -57,7 +57,7 @@ def main() -> None:
         compare(f"lightglue-aliked {count}", folders, ways, pair, arguments.repeats)
 
 
-def prepare(output: Path, weights: Path | None) -> tuple[Path, Path]:
+def prepare_queries(output: Path, weights: Path | None) -> tuple[Path, Path]:
     """Two folders of weights, one of which has ONNX files, too."""
     folders = output / "torch", output / "onnx"
     write_random_weights(folders[0])

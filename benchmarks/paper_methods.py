@@ -17,15 +17,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from benchmark_scenes import rendered
 from random_weights import write_random_weights
-
 from slimsfm.cli.output import quiet
-from slimsfm.datasets.base import ObjectSequences
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import ObjectSequences, map_object
 from slimsfm.datasets.onepose import read_object
-from slimsfm.evaluation.outcomes import Outcomes, join, outcomes_of
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, outcomes_of, prepare_queries, queries_of
+from slimsfm.evaluation.results import Outcomes, join_outcomes
 from slimsfm.evaluation.scores import Scores, score
 from slimsfm.features import Features
 from slimsfm.features.image_matching import load_image_matcher
@@ -183,7 +182,7 @@ def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count:
         "random": [keep_random_images(map_, len(chosen), seed=seed) for seed in range(3)],
     }
     step = max(1, len(made.query.image_paths) // count)
-    queries, rows = prepare(map_, queries_of(made.query)[::step][:count]), {}
+    queries, rows = prepare_queries(map_, queries_of(made.query)[::step][:count]), {}
     for variant, maps in variants.items():
         stored = [_stored(one, output / "map") for one in maps]
         run = _with_boxes if method.is_box_given else evaluate
@@ -191,7 +190,7 @@ def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count:
         rows[variant] = Row(
             references=float(np.mean([len(one.images) for one in stored])),
             points=float(np.mean([len(one.point3D_ids) for one in stored])),
-            scores=score(join(outcomes), metric=True, trials=len(stored)),
+            scores=score(join_outcomes(outcomes), metric=True, draws=len(stored)),
         )
     return rows
 

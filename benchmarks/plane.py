@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+
 from benchmark_scenes import Scene, scenes
 from deceptive_scenes import deceptions
-
-from slimsfm.evaluation.metrics import SURE
+from slimsfm.evaluation.scores import SURE
 from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer

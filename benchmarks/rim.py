@@ -26,8 +26,8 @@ from PIL import Image as PilImage
 from slimsfm.cli import run
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
-from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
+from slimsfm.datasets.base import map_object
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries, queries_of
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import ReferenceGraph, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
@@ -125,7 +125,7 @@ def captured(name: str, shape: str, output: Path) -> Capture:
         with tempfile.TemporaryDirectory() as workspace, quiet():
             write_map(map_object(onepose.read_object(folder / name), Path(workspace)), folder / "map")
     map_ = read_map(folder / "map")
-    queries = prepare(map_, queries_of(onepose.read_object(folder / name).query))
+    queries = prepare_queries(map_, queries_of(onepose.read_object(folder / name).query))
     graph = compute_graph(map_).graph
     return Capture(name=f"{name}, {shape}", path=folder / "map", map=map_, graph=graph, queries=queries)
 

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmark_scenes import Scene, scenes
 
+from benchmark_scenes import Scene, scenes
 from slimsfm.evaluation.protocol import evaluate
 from slimsfm.evaluation.scores import score
 from slimsfm.graph import GraphOptions, compute_graph

@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from slimsfm.datasets.onepose import read_object
-from slimsfm.evaluation.protocol import Query, queries_of
+from slimsfm.evaluation.protocol import PosedQuery, queries_of
 from slimsfm.execution import num_cores, on_threads
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer
@@ -61,7 +61,7 @@ def measure(output: Path, name: str, features: int, size: int) -> tuple[float, l
     return rate, errors
 
 
-def localize(localizer: Localizer, query: Query) -> Localization:
+def localize(localizer: Localizer, query: PosedQuery) -> Localization:
     """From file to pose."""
     return localizer.localize(read_image(query.path), query.camera)
 

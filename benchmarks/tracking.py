@@ -16,10 +16,10 @@ from time import perf_counter, process_time
 
 import numpy as np
 import pycolmap
-from benchmark_scenes import rendered
-from film_frames import NAME, FilmFrames, film_frames
 from jaxtyping import Float64
 
+from benchmark_scenes import rendered
+from film_frames import NAME, FilmFrames, film_frames
 from slimsfm.arrays import Image
 from slimsfm.cli import run
 from slimsfm.geometry import Box, corner_error
@@ -29,7 +29,7 @@ from slimsfm.photos import read_image
 from slimsfm.pose import PoseEstimate
 from slimsfm.progress import shown
 from slimsfm.report.frames import ESTIMATED_RGB, draw_box
-from slimsfm.synthetic.film import FRAMES_PER_SECOND
+from slimsfm.report.query_video import FRAMES_PER_SECOND
 from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 from slimsfm.tracking.video import open_frames, write_video
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from commands import Outcome, slimsfm
 from slimsfm.cli.output import quiet
-from slimsfm.datasets.base import PosedSequence
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import PosedSequence, map_object
 from slimsfm.datasets.onepose import read_object
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map

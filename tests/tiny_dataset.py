@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from slimsfm.datasets.base import Making, ObjectSequences, PosedSequence
+from slimsfm.datasets.base import LoadOptions, ObjectSequences, PosedSequence
 from slimsfm.errors import InputError
-from slimsfm.evaluation.benchmark import Bench, BenchmarkOptions
+from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup
 from slimsfm.evaluation.run import run_benchmark
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
@@ -40,7 +40,7 @@ class TinyDataset:
             raise InputError(f"{self.path} holds no object")
         return tuple(found)
 
-    def load(self, name: str, making: Making) -> ObjectSequences:  # noqa: ARG002
+    def load(self, name: str, making: LoadOptions) -> ObjectSequences:  # noqa: ARG002
         broken = self.path / name / "broken"
         if broken.exists():
             raise FAILURES[broken.read_text()]
@@ -91,4 +91,6 @@ def die() -> None:
 if __name__ == "__main__":
     root, run, stage, time = sys.argv[1:]
     progress = doing_at(stage, int(time), die)
-    run_benchmark(TinyDataset(path=Path(root)), Bench(folder=Path(run), options=OPTIONS, progress=progress))
+    run_benchmark(
+        TinyDataset(path=Path(root)), BenchmarkSetup(folder=Path(run), options=OPTIONS, progress=progress)
+    )

@@ -76,7 +76,7 @@ def test_a_published_layout_gives_the_figures_that_the_synthetic_one_gives(synth
     assert done.code == 0, done.err
     ours, theirs = read_run(synthetic[0]), read_run(tmp_path / "run")
     assert digest_of(theirs.objects) == digest_of(ours.objects)
-    for a, b in zip(ours.objects[0].cells, theirs.objects[0].cells, strict=True):
+    for a, b in zip(ours.objects[0].measurements, theirs.objects[0].measurements, strict=True):
         assert np.array_equal(a.outcomes.error, b.outcomes.error)
 
 

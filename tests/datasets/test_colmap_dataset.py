@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from scenes import exact_map, with_matches
-from slimsfm.datasets.colmap import Colmap
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import map_object
+from slimsfm.datasets.reconstructed import Colmap
 from slimsfm.errors import ImageError, InputError, ModelError
 from slimsfm.features.store import FeatureWriter
 from slimsfm.mapping.map import check_map

@@ -1,7 +1,8 @@
 import pytest
 
 from scenes import exact_map, with_matches
-from slimsfm.datasets.images import hold_out, query_names
+from slimsfm.datasets.base import hold_out
+from slimsfm.datasets.reconstructed import query_names
 from slimsfm.errors import InputError
 from slimsfm.mapping.map import check_map
 

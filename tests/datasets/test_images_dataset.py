@@ -6,16 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slimsfm.datasets.base import Making
-from slimsfm.datasets.images import Images
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import LoadOptions, map_object
+from slimsfm.datasets.reconstructed import Images
 from slimsfm.errors import InputError
 
 
 @pytest.fixture(scope="module")
 def reconstructed(photos, tmp_path_factory):
     """A folder of photos, where its reconstruction is kept, and what came of it."""
-    making = Making(folder=tmp_path_factory.mktemp("made"))
+    making = LoadOptions(folder=tmp_path_factory.mktemp("made"))
     dataset = Images(path=photos, query_every=4)
     return dataset, making, dataset.load("box", making)
 

@@ -131,5 +131,5 @@ def test_a_folder_without_objects_or_no_folder_is_refused(tmp_path):
 
 def test_distortion_has_no_place_in_the_layout(tmp_path):
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=16, height=12, params=[15, 8, 6, 0.1])
-    with pytest.raises(ValueError, match="camera must be a pinhole"):
+    with pytest.raises(ValueError, match="camera must be a pinhole_camera"):
         onepose.write_annotation(tmp_path, camera, POSES)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import map_object
 from slimsfm.datasets.onepose import OnePose
 from slimsfm.errors import InputError
 from slimsfm.geometry import project

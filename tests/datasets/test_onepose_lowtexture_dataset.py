@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from slimsfm.datasets.onepose_lowtexture import OnePoseLowTexture
+from slimsfm.datasets.onepose import OnePoseLowTexture
 from slimsfm.errors import InputError
 
 NAME = "0700-toyrobot-others"

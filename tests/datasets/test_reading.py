@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from slimsfm.datasets.object_model import largest_distance
-from slimsfm.datasets.reading import folders, image_size, numbered, pinhole, rigid
+from slimsfm.datasets.reading import folders, image_size, numbered, pinhole_camera, rigid
 from slimsfm.errors import InputError
 from slimsfm.synthetic.trajectory import mapping_path
 
@@ -29,7 +29,7 @@ def test_a_rounded_rotation_becomes_one_again():
 
 
 def test_the_centre_of_the_first_pixel_moves_by_half_a_pixel():
-    camera = pinhole(np.array([[100.0, 0, 0], [0, 100, 0], [0, 0, 1]]), (64, 48), "file")
+    camera = pinhole_camera(np.array([[100.0, 0, 0], [0, 100, 0], [0, 0, 1]]), (64, 48), "file")
     assert np.allclose(camera.img_from_cam(np.array([[0.0, 0, 1]])), (0.5, 0.5))
 
 

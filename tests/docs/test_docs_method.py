@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from slimsfm.domination import exact, random_greedy
-from slimsfm.evaluation import statistics
+from slimsfm.evaluation import scores
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions
@@ -40,7 +40,7 @@ def test_the_weights_of_the_confidence_are_those_learned():
         ("$c < {:g}$ is not given", LocalizationOptions().min_confidence),
         ("inliers within {:g} px", RansacOptions().max_error_px),
         (r"\sigma_0 = {:g}", problem.PRIOR_SIGMA),
-        ("anew, with replacement, {:g} times", statistics._RESAMPLES),
+        ("anew, with replacement, {:g} times", scores._RESAMPLES),
         ("the smallest of {:g} |", default(random_greedy, "draws")),
         ("Up to {:g} references", trial._MOST_TESTS),
     ],

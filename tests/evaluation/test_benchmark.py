@@ -6,9 +6,14 @@ import pytest
 
 from slimsfm.datasets.base import ObjectModel, ObjectSequences, PosedSequence
 from slimsfm.domination import dominates
-from slimsfm.evaluation.benchmark import Bench, BenchmarkOptions, benchmark_object, graph_options
-from slimsfm.evaluation.methods import parse_method
-from slimsfm.evaluation.protocol import evaluate, prepare
+from slimsfm.evaluation.benchmark import (
+    BenchmarkOptions,
+    BenchmarkSetup,
+    benchmark_object,
+    graph_options,
+    parse_method,
+)
+from slimsfm.evaluation.protocol import evaluate, prepare_queries
 from slimsfm.evaluation.results import map_path
 from slimsfm.evaluation.table import rows_of
 from slimsfm.geometry import corner_error
@@ -44,7 +49,7 @@ def sequences(boulder):
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    return Bench(folder=tmp_path_factory.mktemp("benchmark") / "run", options=OPTIONS)
+    return BenchmarkSetup(folder=tmp_path_factory.mktemp("benchmark") / "run", options=OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +63,11 @@ def kept(bench, variant):
 
 def test_there_is_a_line_of_every_strategy_and_every_variant_that_it_can_use(result):
     images, points = ["full", "dominating", "random"], ["full", "dominating", "default", "random"]
-    assert [cell.key for cell in result.cells] == [
+    assert [cell.key for cell in result.measurements] == [
         *(("sift", "exhaustive", variant) for variant in images),
         *(("sift", "direct", variant) for variant in points),
     ]
-    assert [len(cell.trials) for cell in result.cells] == [1, 1, 5, 1, 1, 1, 5]
+    assert [len(cell.map_runs) for cell in result.measurements] == [1, 1, 5, 1, 1, 1, 5]
 
 
 def test_the_object_is_told_as_it_was_given(result, sequences):
@@ -74,14 +79,14 @@ def test_the_object_is_told_as_it_was_given(result, sequences):
 
 def test_queries_are_localized_well_against_the_full_map(result):
     for strategy in OPTIONS.strategies:
-        outcomes = result.cell("sift", strategy, "full").outcomes
+        outcomes = result.measurement("sift", strategy, "full").outcomes
         assert (outcomes.error < 0.05).all()
         assert (outcomes.confidence > 0.5).all()
 
 
 def test_errors_are_those_of_the_poses(result):
-    for cell in result.cells:
-        for trial in cell.trials:
+    for cell in result.measurements:
+        for trial in cell.map_runs:
             for pose, error, query in zip(
                 trial.outcomes.cam_from_world, trial.outcomes.error, result.queries, strict=True
             ):
@@ -113,22 +118,22 @@ def test_the_dominating_set_dominates_the_graph_that_is_kept(result, bench):
 def test_maps_are_kept_and_are_those_that_were_measured(result, bench):
     assert {path.name for path in kept(bench, "full").parent.iterdir()} == {"full", "dominating", "default"}
     for variant in ("full", "dominating", "default"):
-        (trial,) = result.cell("sift", "direct", variant).trials
+        (trial,) = result.measurement("sift", "direct", variant).map_runs
         made = read_map(kept(bench, variant))
         assert (trial.references, trial.points) == (len(made.images), len(made.point3D_ids))
         assert trial.map_bytes == bytes_by_part(kept(bench, variant))["total"]
     (mapped,) = result.maps
     assert list(read_map(kept(bench, "dominating")).images) == list(mapped.dominating_set)
-    assert result.cell("sift", "direct", "dominating").trials[0].points == mapped.dominating_points
+    assert result.measurement("sift", "direct", "dominating").map_runs[0].points == mapped.dominating_points
     assert read_map(kept(bench, "default")).is_for_direct_matching
 
 
 def test_random_rows_are_the_mean_over_the_five_seeds(result, bench):
     full, count = read_map(kept(bench, "full")), len(result.maps[0].dominating_set)
-    prepared = prepare(full, list(result.queries))
-    cell = result.cell("sift", "direct", "random")
+    prepared = prepare_queries(full, list(result.queries))
+    cell = result.measurement("sift", "direct", "random")
     found = []
-    for seed, trial in enumerate(cell.trials):
+    for seed, trial in enumerate(cell.map_runs):
         drawn = keep_random_images(full, count, seed=seed)
         assert (trial.references, trial.points) == (count, len(drawn.point3D_ids))
         outcomes = evaluate(drawn, prepared, "direct")
@@ -137,15 +142,17 @@ def test_random_rows_are_the_mean_over_the_five_seeds(result, bench):
     row = rows_of(result)[-1]
     assert (row.strategy, row.variant, row.scores.queries) == ("direct", "random", 2)
     assert row.scores.add[0.1] == pytest.approx(100 * np.mean(np.array(found) < 0.1))
-    assert row.points == pytest.approx(np.mean([trial.points for trial in cell.trials]))
-    assert row.map_bytes == pytest.approx(np.mean([trial.map_bytes for trial in cell.trials]))
+    assert row.points == pytest.approx(np.mean([trial.points for trial in cell.map_runs]))
+    assert row.map_bytes == pytest.approx(np.mean([trial.map_bytes for trial in cell.map_runs]))
 
 
 def test_features_of_a_query_are_found_once_for_all_lines(result):
-    extract = [trial.outcomes.seconds[:, 0].tolist() for cell in result.cells for trial in cell.trials]
+    extract = [
+        trial.outcomes.seconds[:, 0].tolist() for cell in result.measurements for trial in cell.map_runs
+    ]
     assert all(one == extract[0] for one in extract)
     assert min(extract[0]) > 0
-    assert all((trial.outcomes.seconds > 0).all() for cell in result.cells for trial in cell.trials)
+    assert all((trial.outcomes.seconds > 0).all() for cell in result.measurements for trial in cell.map_runs)
 
 
 @pytest.fixture
@@ -156,7 +163,7 @@ def again(bench, result, tmp_path):
 
     def measure(sequences, variants=("dominating",), reduction=ReductionOptions()):
         options = BenchmarkOptions(strategies=("direct",), variants=variants, reduction=reduction)
-        return benchmark_object(sequences, Bench(folder=tmp_path, options=options))
+        return benchmark_object(sequences, BenchmarkSetup(folder=tmp_path, options=options))
 
     return measure
 
@@ -172,11 +179,11 @@ def test_an_object_with_a_model_is_measured_by_its_vertices(again, sequences, re
     far = np.array([[0.0, 0.0, 3.0]])
     model = ObjectModel(vertices=far, diameter=2.0, symmetric=False)
     found = again(replace(sequences, model=model))
-    outcomes = found.cells[0].outcomes
+    outcomes = found.measurements[0].outcomes
     for pose, error, query in zip(outcomes.cam_from_world, outcomes.error, found.queries, strict=True):
         if pose is not None:
             assert error == pytest.approx(np.linalg.norm(pose * far - query.cam_from_world * far) / 2)
-    before = result.cell("sift", "direct", "dominating").outcomes
+    before = result.measurement("sift", "direct", "dominating").outcomes
     assert [pose is None for pose in outcomes.cam_from_world] == [
         pose is None for pose in before.cam_from_world
     ]
@@ -185,16 +192,18 @@ def test_an_object_with_a_model_is_measured_by_its_vertices(again, sequences, re
 
 def test_random_variants_of_several_sizes_do_not_get_into_each_others_way(again, sequences):
     """They lie at temporary places, and a map reads its features when it needs them."""
-    two, three = again(sequences, variants=("random:2", "random:3")).cells
-    assert [trial.references for trial in two.trials] == [2] * 5
-    assert [trial.references for trial in three.trials] == [3] * 5
-    (alone,) = again(sequences, variants=("random:2",)).cells
-    for one, other in zip(two.trials, alone.trials, strict=True):
+    two, three = again(sequences, variants=("random:2", "random:3")).measurements
+    assert [trial.references for trial in two.map_runs] == [2] * 5
+    assert [trial.references for trial in three.map_runs] == [3] * 5
+    (alone,) = again(sequences, variants=("random:2",)).measurements
+    for one, other in zip(two.map_runs, alone.map_runs, strict=True):
         assert one.outcomes.error.tolist() == other.outcomes.error.tolist()
 
 
 def test_maps_are_built_with_the_features_of_the_method(tmp_path):
-    bench = Bench(folder=tmp_path, options=OPTIONS, build=BuildOptions(max_features=500, matcher="lightglue"))
+    bench = BenchmarkSetup(
+        folder=tmp_path, options=OPTIONS, build=BuildOptions(max_features=500, matcher="lightglue")
+    )
     built = bench.build_with(parse_method("aliked+superglue"))
     assert (built.extractor, built.matcher, built.max_features) == ("aliked", "superglue", 500)
     assert bench.build_with(parse_method("aliked")).matcher == "lightglue"

@@ -5,25 +5,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import DOMINATING, FULL, cell_like, mapped_like, result_like, run_like
+from handmade import DOMINATING, FULL, mapped_like, measurement_like, result_like, run_like
 
-from slimsfm.evaluation.columns import MAP, number, size
-from slimsfm.evaluation.comparison import against_full
+from slimsfm.evaluation.comparison import against_full, summarize_domination
 from slimsfm.evaluation.formats import (
-    all_rows,
     csv_queries,
     csv_table,
-    is_metric,
+    format_p_value,
+    format_value,
     latex_table,
     markdown_comparisons,
     markdown_page,
     markdown_summaries,
     markdown_table,
-    p_value,
-    shown,
 )
-from slimsfm.evaluation.summary import summarize_domination
-from slimsfm.evaluation.table import average_rows, rows_of
+from slimsfm.evaluation.table import (
+    MAP_COLUMNS,
+    all_rows,
+    average_rows,
+    format_bytes,
+    format_number,
+    is_metric,
+    rows_of,
+)
 
 DASH, TIMES = "\N{EN DASH}", "\N{MULTIPLICATION SIGN}"
 RANDOM = ("sift", "exhaustive", "random:k=2,rim")
@@ -34,9 +38,9 @@ AWKWARD = "0408_box & 50%|{x}~^$#\\"
 def run():
     """An object in centimetres whose name is awkward, one of unknown scale, and one that failed."""
     cells = [
-        cell_like(FULL, [0.01, 0.02, np.inf], references=1234, map_bytes=24_000_000),
-        cell_like(DOMINATING, [0.01, 0.2, 0.03]),
-        cell_like(RANDOM, [np.inf] * 3, [0.01, np.inf, 0.03]),
+        measurement_like(FULL, [0.01, 0.02, np.inf], references=1234, map_bytes=24_000_000),
+        measurement_like(DOMINATING, [0.01, 0.2, 0.03]),
+        measurement_like(RANDOM, [np.inf] * 3, [0.01, np.inf, 0.03]),
     ]
     objects = [result_like(AWKWARD, *cells), result_like("mug", *cells, unit="unknown")]
     return run_like(*objects, failed={"jar": "jar/box3d_corners.txt is missing"})
@@ -107,8 +111,8 @@ def test_without_a_metric_object_there_are_no_columns_of_centimetres(run):
 def test_comparisons_tell_direction_and_doubt(run):
     (lines,) = tables_in(markdown_comparisons(against_full(run.objects[:1])))
     first = dict(zip(cells_of(lines[0]), cells_of(lines[2]), strict=True))
-    assert first["Line"] == "sift, exhaustive, dominating"
-    assert first["against"] == "sift, exhaustive, full"
+    assert first["Row"] == "sift, exhaustive, dominating"
+    assert first["Baseline"] == "sift, exhaustive, full"
     assert first["ADD-0.1d"] == "66.7 → 66.7"
     assert first["p"] == "1.000"
     assert first["faster"] == f"1.0{TIMES} (1.0 to 1.0)"
@@ -116,7 +120,7 @@ def test_comparisons_tell_direction_and_doubt(run):
 
 
 def test_small_probabilities_are_not_called_zero():
-    assert [p_value(value) for value in (1.0, 0.05, 0.001, 0.00099, 0.0)] == [
+    assert [format_p_value(value) for value in (1.0, 0.05, 0.001, 0.00099, 0.0)] == [
         *("1.000", "0.050", "0.001"),
         *("< 0.001", "< 0.001"),
     ]
@@ -124,7 +128,7 @@ def test_small_probabilities_are_not_called_zero():
 
 def test_intervals_are_shown_where_there_are_some(run):
     row = rows_of(run.objects[0])[0]
-    assert shown(row, MAP[0], interval=True) == "1,234"
+    assert format_value(row, MAP_COLUMNS[0], interval=True) == "1,234"
 
 
 ENVIRONMENT = re.compile(r"\\(begin|end)\{([a-z*]+)\}")
@@ -203,8 +207,8 @@ def test_the_csv_of_queries_has_every_query_of_every_draw(run):
     wanted = [
         (result, cell, draw, trial.outcomes, i)
         for result in run.objects
-        for cell in result.cells
-        for draw, trial in enumerate(cell.trials)
+        for cell in result.measurements
+        for draw, trial in enumerate(cell.map_runs)
         for i in range(3)
     ]
     for line, (result, cell, draw, outcomes, i) in zip(lines, wanted, strict=True):
@@ -224,10 +228,10 @@ def test_without_objects_there_are_no_queries():
 def test_the_page_tells_all(run, rows, comparisons):
     page = markdown_page(run, rows, comparisons)
     assert page.startswith("# TinyDataset toys\n")
-    assert "**jar could not be measured**: jar/box3d_corners.txt is missing" in page
+    assert "**jar failed**: jar/box3d_corners.txt is missing" in page
     assert "- cpu: abacus\n- python: 3.99\n" in page
     assert [len(table) - 2 for table in tables_in(page)] == [len(rows), len(comparisons), 1]
-    assert "could not be measured" not in markdown_page(replace(run, failed={}), rows, comparisons)
+    assert "failed" not in markdown_page(replace(run, failed={}), rows, comparisons)
 
 
 def test_averages_come_first(run, rows):
@@ -243,7 +247,7 @@ def test_sizes_of_dominating_sets_are_shown(run):
 
 
 def test_counts_and_sizes_are_written_in_the_unit_that_suits_them():
-    assert [number(value) for value in (7.0, 12_345.0, 3.25)] == ["7", "12,345", "3.2"]
-    assert [size(value) for value in (0, 999, 1000, 9_949, 24e6, 999.6e6, 5e12)] == [
+    assert [format_number(value) for value in (7.0, 12_345.0, 3.25)] == ["7", "12,345", "3.2"]
+    assert [format_bytes(value) for value in (0, 999, 1000, 9_949, 24e6, 999.6e6, 5e12)] == [
         *("0 B", "999 B", "1.0 kB", "9.9 kB", "24 MB", "1.0 GB", "5000 GB"),
     ]

@@ -5,7 +5,7 @@ import pytest
 
 from scenes import algorithm_1, exact_map
 from slimsfm.domination import dominates
-from slimsfm.evaluation.variants import VARIANTS, Making, parse_variant
+from slimsfm.evaluation.variants import VARIANTS, VariantInputs, parse_variant
 from slimsfm.mapping.io import weigh_map
 from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
 
@@ -19,7 +19,7 @@ def narrow():
 @pytest.fixture(scope="module")
 def making(narrow):
     graph, reduction = algorithm_1(narrow), ReductionOptions()
-    return Making(
+    return VariantInputs(
         map=narrow,
         graph=graph,
         reduction=reduction,

@@ -1,6 +1,6 @@
 import pytest
 
-from slimsfm.evaluation.methods import Method, parse_method
+from slimsfm.evaluation.benchmark import Method, parse_method
 
 
 @pytest.mark.parametrize(

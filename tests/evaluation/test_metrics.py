@@ -5,20 +5,12 @@ import numpy as np
 import pycolmap
 import pytest
 from handmade import random_pose, rigid
+from slimsfm.evaluation.metrics import errors_of_poses
 
 from scenes import BOX
 from slimsfm.datasets.base import ObjectModel
-from slimsfm.evaluation.metrics import (
-    NO_POSE,
-    PoseError,
-    add_percent,
-    deg_cm_percent,
-    errors_of_poses,
-    model_error,
-    pose_error,
-    within_deg_cm,
-    wrong_when_sure,
-)
+from slimsfm.evaluation.protocol import NO_POSE, PoseError, model_error, pose_error
+from slimsfm.evaluation.scores import add_percent, deg_cm_percent, within_deg_cm, wrong_when_sure
 from slimsfm.geometry import Box
 
 DIAGONAL = 2 * np.sqrt(1.0**2 + 0.8**2 + 0.6**2)

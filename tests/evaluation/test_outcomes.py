@@ -7,7 +7,8 @@ from handmade import outcomes_like, rigid
 
 from scenes import BOX
 from slimsfm.datasets.base import ObjectModel
-from slimsfm.evaluation.outcomes import join, outcomes_of
+from slimsfm.evaluation.protocol import outcomes_of
+from slimsfm.evaluation.results import join_outcomes
 from slimsfm.localization import Localization, Seconds
 from slimsfm.pose import PoseEstimate
 
@@ -67,7 +68,7 @@ def test_every_field_is_of_as_many_queries():
 
 def test_joined_outcomes_stand_one_after_the_other():
     first, second = outcomes_like([0.1, np.inf]), outcomes_like([0.3], references=8)
-    both = join([first, second])
+    both = join_outcomes([first, second])
     assert both.error.tolist() == [0.1, np.inf, 0.3]
     assert both.references.tolist() == [3, 3, 8]
     assert both.seconds.shape == (3, 3)

@@ -3,11 +3,11 @@ import pytest
 
 from scenes import camera, exact_map
 from slimsfm.evaluation.protocol import (
+    PosedQuery,
     PreparedQuery,
-    Query,
     evaluate,
     localize_all,
-    prepare,
+    prepare_queries,
     queries_of,
 )
 from strategies import CLASSICAL
@@ -23,7 +23,7 @@ def queries(narrow, tmp_path):
     """The references themselves, whose features are known and so need no file."""
     return [
         PreparedQuery(
-            query=Query(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
+            query=PosedQuery(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
             features=narrow.features[name],
             extract_seconds=0.25,
         )
@@ -67,7 +67,7 @@ def test_queries_that_cannot_be_localized_stay_in_their_place(narrow, queries):
 
 def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
     map_, queries = boulder.map, queries_of(boulder.mapping)[:3]
-    for query, prepared in zip(queries, prepare(map_, queries), strict=True):
+    for query, prepared in zip(queries, prepare_queries(map_, queries), strict=True):
         stored = map_.features[query.path.name]
         assert (prepared.features.keypoints == stored.keypoints).all()
         assert (prepared.features.descriptors == stored.descriptors).all()

@@ -12,7 +12,7 @@ import pytest
 import tiny_dataset
 from commands import contents
 from slimsfm.errors import InputError, OutputError
-from slimsfm.evaluation.benchmark import Bench
+from slimsfm.evaluation.benchmark import BenchmarkSetup
 from slimsfm.evaluation.result_files import digest_of, object_to_json, read_object_result
 from slimsfm.evaluation.run import object_path, run_benchmark
 from slimsfm.execution import processes
@@ -53,7 +53,7 @@ def breakable(dataset, tmp_path):
 
 
 def bench_in(folder, **how):
-    return Bench(folder=folder, options=OPTIONS, **how)
+    return BenchmarkSetup(folder=folder, options=OPTIONS, **how)
 
 
 def break_object(dataset, name, how):
@@ -223,12 +223,12 @@ def test_a_folder_of_other_options_is_refused_until_it_may_be_overwritten(whole,
     shutil.copytree(whole.folder, folder)
     before = contents(folder)
     options = replace(OPTIONS, strategies=("direct",), variants=("full",))
-    bench = Bench(folder=folder, options=options)
+    bench = BenchmarkSetup(folder=folder, options=options)
     with pytest.raises(OutputError, match=r"run: holds a run of other options; choose .* --overwrite"):
         run_benchmark(dataset, bench)
     assert contents(folder) == before
     run = run_benchmark(dataset, bench, overwrite=True)
-    assert [cell.key for one in run.objects for cell in one.cells] == [("sift", "direct", "full")] * 2
+    assert [cell.key for one in run.objects for cell in one.measurements] == [("sift", "direct", "full")] * 2
     assert {path.name for path in (folder / "maps" / "can" / "sift").iterdir()} == {"full"}
 
 
@@ -284,7 +284,7 @@ def test_what_a_killed_process_left_in_the_folder_is_in_nobodys_way(dataset, tmp
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".run.json.partial").write_text("half")
     options = replace(OPTIONS, strategies=("direct",), variants=("full",))
-    assert not run_benchmark(dataset, Bench(folder=tmp_path / "run", options=options)).failed
+    assert not run_benchmark(dataset, BenchmarkSetup(folder=tmp_path / "run", options=options)).failed
 
 
 def test_maps_of_an_object_that_failed_are_not_used_again(breakable, tmp_path):

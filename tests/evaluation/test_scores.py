@@ -2,15 +2,14 @@ import numpy as np
 import pytest
 from handmade import outcomes_like
 
-from slimsfm.evaluation.outcomes import join
-from slimsfm.evaluation.scores import mean_scores, score, shares
+from slimsfm.evaluation.scores import criteria, mean_scores, score
 
 
 def test_scores_sum_up_mixed_outcomes():
     """Errors as relative, hundredfold as degrees, and as metres."""
     quick, slow = (0.01, 0.02, 0.005), (0.06, 0.12, 0.005)
     found = [outcomes_like([0.005, 0.03, 0.2, np.inf], seconds=quick), outcomes_like([np.inf], seconds=slow)]
-    scores = score(join(found), metric=True)
+    scores = score(join_outcomes(found), metric=True)
     assert scores.queries == 5
     assert scores.localized == 60.0
     assert scores.add == {0.1: 40.0, 0.05: 40.0, 0.02: 20.0}
@@ -26,14 +25,14 @@ def test_scores_sum_up_mixed_outcomes():
 
 def test_queries_of_several_trials_are_counted_once():
     outcomes = outcomes_like([0.01, 0.01, np.inf, 0.01])
-    assert score(outcomes, metric=True, trials=2).queries == 2
-    assert score(outcomes, metric=True, trials=2).localized == 75.0
+    assert score(outcomes, metric=True, map_runs=2).queries == 2
+    assert score(outcomes, metric=True, map_runs=2).localized == 75.0
 
 
 def test_without_a_metric_unit_there_are_no_centimetres():
     scores = score(outcomes_like([0.0]), metric=False)
     assert scores.deg_cm is None
-    assert set(shares(metric=False)) == {"localized", "add_0.1d", "add_0.05d", "add_0.02d"}
+    assert set(criteria(metric=False)) == {"localized", "add_0.1d", "add_0.05d", "add_0.02d"}
 
 
 def test_the_median_is_infinite_unless_more_than_half_are_localized():
@@ -53,7 +52,7 @@ def test_where_nothing_is_localized_everything_is_a_failure_and_nobody_was_sure(
 def test_the_shares_are_the_percentages_query_by_query():
     outcomes = outcomes_like([0.005, 0.02, 0.03, 0.05, 0.07, 0.1, np.inf])
     scores = score(outcomes, metric=True)
-    percent = {name: 100 * fulfil(outcomes).mean() for name, fulfil in shares(metric=True).items()}
+    percent = {name: 100 * fulfil(outcomes).mean() for name, fulfil in criteria(metric=True).items()}
     assert percent == {
         "localized": scores.localized,
         **{f"add_{fraction}d": value for fraction, value in scores.add.items()},

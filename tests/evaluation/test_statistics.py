@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from slimsfm.evaluation.statistics import bootstrap, paired_p_value
+from slimsfm.evaluation.scores import bootstrap, paired_p_value
 
 
 def means(found):

@@ -1,13 +1,13 @@
 from dataclasses import replace
 
 import pytest
-from handmade import FULL, cell_like, mapped_like, result_like
+from handmade import FULL, mapped_like, measurement_like, result_like
 
-from slimsfm.evaluation.summary import summarize_domination
+from slimsfm.evaluation.comparison import summarize_domination
 
 
 def test_dominating_sets_are_summed_up_by_method():
-    plain = result_like("toy", cell_like(FULL, [0.01]))
+    plain = result_like("toy", measurement_like(FULL, [0.01]))
     sizes = [(10, 2, 40), (20, 3, 50), (40, 10, 90)]
     objects = [
         replace(

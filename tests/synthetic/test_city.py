@@ -5,11 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from city import CityOptions, city_map
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.graph.candidates import covisible_pairs
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import check_map
-from slimsfm.synthetic.city import CityOptions, city_map
 
 
 def city(images=60, **options):

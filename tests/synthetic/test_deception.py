@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from slimsfm.synthetic.deception import (
+from deception import (
     DECEPTIONS,
     FLOOR_PERIOD,
     TWIN_FROM_OBJECT,

@@ -3,8 +3,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from film import film
 from slimsfm.geometry import project
-from slimsfm.synthetic.film import film
 from slimsfm.synthetic.render import visible_meshes
 
 FRAMES = 400

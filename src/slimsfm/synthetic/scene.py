@@ -69,7 +69,7 @@ def mapping_take(name: str, frames: int, width: int, height: int, seed: int) -> 
     wood = texture.tinted_noise(rng, 512, 512, (186, 178, 168), 0.16)
     scene = Scene([mesh, shapes.ground(2.4, wood, shapes.lowest(mesh))], Light())
     path = trajectory.mapping_path(frames, viewing_distance(mesh))
-    return Take(scene=scene, camera=pinhole(width, height, 0.0), cam_from_object=tuple(path), seed=key)
+    return Take(scene=scene, camera=phone_camera(width, height, 0.0), cam_from_object=tuple(path), seed=key)
 
 
 def query_take(name: str, frames: int, width: int, height: int, seed: int) -> Take:
@@ -89,7 +89,7 @@ def query_take(name: str, frames: int, width: int, height: int, seed: int) -> Ta
     rng = np.random.default_rng(key)
     scene = elsewhere(rng, mesh)
     path = trajectory.query_path(rng, frames, 1.3 * viewing_distance(mesh))
-    return Take(scene=scene, camera=pinhole(width, height, 0.02), cam_from_object=tuple(path), seed=key)
+    return Take(scene=scene, camera=phone_camera(width, height, 0.02), cam_from_object=tuple(path), seed=key)
 
 
 TAKES: dict[str, Callable[[str, int, int, int, int], Take]] = {"mapping": mapping_take, "query": query_take}
@@ -118,7 +118,7 @@ def viewing_distance(mesh: trimesh.Trimesh) -> float:
     return 1.5 * object_box(mesh).diagonal
 
 
-def pinhole(width: int, height: int, change: float) -> pycolmap.Camera:
+def phone_camera(width: int, height: int, change: float) -> pycolmap.Camera:
     """A camera that sees 56 degrees from left to right, its centre slightly off; `change` tells two apart."""
     focal = 600 / 640 * width * (1 + change)
     center = (width * (0.5 + 0.006 - change), height * (0.5 - 0.008 + change))

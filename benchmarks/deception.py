@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from slimsfm.synthetic import shapes, texture, trajectory
 from slimsfm.synthetic.objects import printed_box
 from slimsfm.synthetic.render import Light, Scene
-from slimsfm.synthetic.scene import EVENING, Take, elsewhere, pinhole, posts, things, viewing_distance
+from slimsfm.synthetic.scene import EVENING, Take, elsewhere, phone_camera, posts, things, viewing_distance
 from slimsfm.synthetic.texture import Picture
 
 FLOOR_PERIOD, WALL_PERIOD = 0.12, 0.10
@@ -70,7 +70,7 @@ def patterned_room(frames: int, width: int, height: int, seed: int) -> Take:
     views = _views(sweep, 15 + 40 * share, 0.62 + 0.1 * np.sin(17 * share))
     aims = rng.uniform(-0.1, 0.1, (frames, 2))
     poses = [_aim(eye, aim, 0.0) for eye, aim in zip(views, aims, strict=True)]
-    return _take(scene, pinhole(width, height, 0.0), poses, _key(seed, "patterned_room", _MAPPING))
+    return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "patterned_room", _MAPPING))
 
 
 def patterned_room_query(frames: int, width: int, height: int, seed: int) -> Take:
@@ -86,7 +86,7 @@ def patterned_room_query(frames: int, width: int, height: int, seed: int) -> Tak
     rolls = rng.uniform(-12, 12, frames).tolist()
     poses = [_aim(*view) for view in zip(views, aims, rolls, strict=True)]
     return _take(
-        Scene(meshes, light), pinhole(width, height, 0.02), poses, _key(seed, "patterned_room", _QUERY)
+        Scene(meshes, light), phone_camera(width, height, 0.02), poses, _key(seed, "patterned_room", _QUERY)
     )
 
 
@@ -130,7 +130,7 @@ def twins(frames: int, width: int, height: int, seed: int) -> Take:
     mesh = printed_box(seed)
     scene = Scene([mesh, _marble(mesh, seed)], Light())
     poses = trajectory.mapping_path(frames, 1.1 * viewing_distance(mesh))
-    return _take(scene, pinhole(width, height, 0.0), poses, _key(seed, "twins", _MAPPING))
+    return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "twins", _MAPPING))
 
 
 def twins_query(frames: int, width: int, height: int, seed: int) -> Take:
@@ -142,7 +142,7 @@ def twins_query(frames: int, width: int, height: int, seed: int) -> Take:
     share = 0.5 + 0.5 * np.sin(2 * np.pi * 3.1 * (np.arange(frames) + 0.5) / frames)
     shifts = [pycolmap.Rigid3d(pycolmap.Rotation3d(), -s * TWIN_FROM_OBJECT.translation) for s in share]
     poses = [pose * shift for pose, shift in zip(around, shifts, strict=True)]
-    return _take(scene, pinhole(width, height, 0.02), poses, _key(seed, "twins", _QUERY))
+    return _take(scene, phone_camera(width, height, 0.02), poses, _key(seed, "twins", _QUERY))
 
 
 def ambiguous_box(seed: int) -> trimesh.Trimesh:
@@ -166,7 +166,7 @@ def mirrored_box(frames: int, width: int, height: int, seed: int) -> Take:
     wood = texture.tinted_noise(rng, 512, 512, (186, 178, 168), 0.16)
     scene = Scene([mesh, shapes.ground(2.4, wood, shapes.lowest(mesh))], Light())
     poses = trajectory.mapping_path(frames, viewing_distance(mesh))
-    return _take(scene, pinhole(width, height, 0.0), poses, _key(seed, "mirrored_box", _MAPPING))
+    return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "mirrored_box", _MAPPING))
 
 
 def mirrored_box_query(frames: int, width: int, height: int, seed: int) -> Take:
@@ -174,7 +174,7 @@ def mirrored_box_query(frames: int, width: int, height: int, seed: int) -> Take:
     rng, mesh = _rng(seed, "mirrored_box", _QUERY), ambiguous_box(seed)
     scene = elsewhere(rng, mesh)
     poses = trajectory.query_path(rng, frames, 1.4 * viewing_distance(mesh))
-    return _take(scene, pinhole(width, height, 0.02), poses, _key(seed, "mirrored_box", _QUERY))
+    return _take(scene, phone_camera(width, height, 0.02), poses, _key(seed, "mirrored_box", _QUERY))
 
 
 DECEPTIONS: dict[str, Deception] = {

@@ -17,7 +17,7 @@ from slimsfm.synthetic.render import Light, Scene, render, visible_meshes
 from slimsfm.synthetic.scene import (
     elsewhere,
     object_box,
-    pinhole,
+    phone_camera,
     textured_object,
     viewing_distance,
     with_noise,
@@ -116,7 +116,7 @@ def film(
     return Film(
         scene=scene,
         plate=plate,
-        camera=pinhole(width, height, _LENS),
+        camera=phone_camera(width, height, _LENS),
         cam_from_object=tuple(poses),
         cam_from_plate=plates,
         visible=visible,
@@ -203,7 +203,7 @@ def _blocked(image: Image, plate: Scene, camera: pycolmap.Camera, cam_from_plate
 
 
 def _coarse(width: int, height: int) -> pycolmap.Camera:
-    return pinhole(_COARSE, round(_COARSE * height / width), _LENS)
+    return phone_camera(_COARSE, round(_COARSE * height / width), _LENS)
 
 
 def _visible(
