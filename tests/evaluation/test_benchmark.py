@@ -61,7 +61,7 @@ def kept(bench, variant):
     return map_path(bench.folder, "boulder", "sift", variant)
 
 
-def test_there_is_a_line_of_every_strategy_and_every_variant_that_it_can_use(result):
+def test_each_strategy_is_measured_on_each_variant_that_supports_it(result):
     images, points = ["full", "dominating", "random"], ["full", "dominating", "default", "random"]
     assert [cell.key for cell in result.measurements] == [
         *(("sift", "exhaustive", variant) for variant in images),
@@ -70,7 +70,7 @@ def test_there_is_a_line_of_every_strategy_and_every_variant_that_it_can_use(res
     assert [len(cell.map_runs) for cell in result.measurements] == [1, 1, 5, 1, 1, 1, 5]
 
 
-def test_the_object_is_told_as_it_was_given(result, sequences):
+def test_the_result_describes_the_object(result, sequences):
     assert (result.name, result.unit, result.images) == ("boulder", "metre", sequences.mapping.folder)
     assert result.box is sequences.box
     assert [query.path for query in result.queries] == list(sequences.query.image_paths)
@@ -84,7 +84,7 @@ def test_queries_are_localized_well_against_the_full_map(result):
         assert (outcomes.confidence > 0.5).all()
 
 
-def test_errors_are_those_of_the_poses(result):
+def test_errors_match_the_poses(result):
     for cell in result.measurements:
         for trial in cell.map_runs:
             for pose, error, query in zip(
@@ -94,7 +94,7 @@ def test_errors_are_those_of_the_poses(result):
                 assert error == expected
 
 
-def test_the_dominating_set_dominates_the_graph_that_is_kept(result, bench):
+def test_the_dominating_set_dominates_the_stored_graph(result, bench):
     (mapped,) = result.maps
     path = kept(bench, "full")
     full = read_map(path)
@@ -115,7 +115,7 @@ def test_the_dominating_set_dominates_the_graph_that_is_kept(result, bench):
     assert mapped.points == len(full.point3D_ids)
 
 
-def test_maps_are_kept_and_are_those_that_were_measured(result, bench):
+def test_the_stored_maps_are_the_measured_ones(result, bench):
     assert {path.name for path in kept(bench, "full").parent.iterdir()} == {"full", "dominating", "default"}
     for variant in ("full", "dominating", "default"):
         (trial,) = result.measurement("sift", "direct", variant).map_runs
@@ -146,7 +146,7 @@ def test_random_rows_are_the_mean_over_the_five_seeds(result, bench):
     assert row.map_bytes == pytest.approx(np.mean([trial.map_bytes for trial in cell.map_runs]))
 
 
-def test_features_of_a_query_are_found_once_for_all_lines(result):
+def test_query_features_are_extracted_once_for_all_measurements(result):
     extract = [
         trial.outcomes.seconds[:, 0].tolist() for cell in result.measurements for trial in cell.map_runs
     ]
@@ -190,7 +190,7 @@ def test_an_object_with_a_model_is_measured_by_its_vertices(again, sequences, re
     assert not np.array_equal(outcomes.error, before.error)
 
 
-def test_random_variants_of_several_sizes_do_not_get_into_each_others_way(again, sequences):
+def test_random_variants_of_several_sizes_do_not_interfere(again, sequences):
     """They lie at temporary places, and a map reads its features when it needs them."""
     two, three = again(sequences, variants=("random:2", "random:3")).measurements
     assert [trial.references for trial in two.map_runs] == [2] * 5
@@ -200,17 +200,17 @@ def test_random_variants_of_several_sizes_do_not_get_into_each_others_way(again,
         assert one.outcomes.error.tolist() == other.outcomes.error.tolist()
 
 
-def test_maps_are_built_with_the_features_of_the_method(tmp_path):
+def test_maps_are_built_with_the_extractor_of_the_method(tmp_path):
     bench = BenchmarkSetup(
         folder=tmp_path, options=OPTIONS, build=BuildOptions(max_features=500, matcher="lightglue")
     )
-    built = bench.build_with(parse_method("aliked+superglue"))
+    built = bench.build_options(parse_method("aliked+superglue"))
     assert (built.extractor, built.matcher, built.max_features) == ("aliked", "superglue", 500)
-    assert bench.build_with(parse_method("aliked")).matcher == "lightglue"
-    assert bench.dataset_making("toy").folder == tmp_path / "truth" / "toy"
+    assert bench.build_options(parse_method("aliked")).matcher == "lightglue"
+    assert bench.load_options("toy").folder == tmp_path / "truth" / "toy"
 
 
-def test_graphs_are_matched_as_the_method_says():
+def test_graphs_use_the_matcher_of_the_method():
     options = BenchmarkOptions(edges="hybrid", reduction=ReductionOptions(threshold=0.02))
     found = graph_options(options, parse_method("aliked+lightglue"))
     assert (found.edges, found.candidates, found.threshold, found.matcher) == (
@@ -224,21 +224,24 @@ def test_graphs_are_matched_as_the_method_says():
     ("values", "message"),
     [
         ({"strategies": ("direct", "guess")}, "strategy must be auto or one of .*, got 'guess'"),
-        ({"strategies": ()}, "strategies must be different ones, got none"),
-        ({"strategies": ("direct", "direct")}, "strategies must be different ones, got direct, direct"),
+        ({"strategies": ()}, "strategies must be distinct and not empty, got none"),
+        (
+            {"strategies": ("direct", "direct")},
+            "strategies must be distinct and not empty, got direct, direct",
+        ),
         ({"variants": ("half",)}, "variants must be among full, .*, got 'half'"),
-        ({"variants": ()}, "variants must be different ones, got none"),
-        ({"variants": ("random:3", "random:3")}, "variants must be different ones"),
+        ({"variants": ()}, "variants must be distinct and not empty, got none"),
+        ({"variants": ("random:3", "random:3")}, "variants must be distinct"),
         ({"variants": ("points",)}, "variants: points takes a number of points"),
-        ({"methods": ("guess",)}, "methods must be made of .*, got 'guess'"),
-        ({"methods": ()}, "methods must be different ones, got none"),
+        ({"methods": ("guess",)}, "the extractor of a method must be one of .*, got 'guess'"),
+        ({"methods": ()}, "methods must be distinct and not empty, got none"),
     ],
 )
-def test_bad_options_are_named(values, message):
+def test_invalid_options_are_named_in_the_error(values, message):
     with pytest.raises(ValueError, match=message):
         BenchmarkOptions(**values)
 
 
-def test_a_variant_may_be_compared_in_several_settings():
+def test_a_variant_may_occur_with_several_settings():
     options = BenchmarkOptions(variants=("random:3", "random:4", "dominating", "dominating:k=2"))
     assert [one.kind for one in options.parsed_variants] == ["random", "random", "dominating", "dominating"]

@@ -14,7 +14,7 @@ RIGHT, WRONG = 0.01, 0.5
 DIRECT = ("sift", "direct", "full")
 
 
-def test_a_line_that_is_better_gains_and_one_that_is_worse_loses():
+def test_a_better_row_gains_and_a_worse_row_loses():
     poor = measurement_like(FULL, [RIGHT] * 4 + [WRONG] * 6)
     good = measurement_like(DOMINATING, [RIGHT] * 10)
     gain = compare_measurements("toy", [(poor, good)])
@@ -28,7 +28,7 @@ def test_a_line_that_is_better_gains_and_one_that_is_worse_loses():
     assert loss.p_value == gain.p_value == pytest.approx(stats.binomtest(6, 6).pvalue)
 
 
-def test_faster_and_smaller_are_how_many_times_less_it_takes():
+def test_faster_and_smaller_are_ratios():
     """Extraction does not count: it is the same for both."""
     before = measurement_like(FULL, [RIGHT] * 3, seconds=(9.0, 0.3, 0.1), map_bytes=5000)
     after = measurement_like(DOMINATING, [RIGHT] * 3, seconds=(1.0, 0.05, 0.05), map_bytes=1000)
@@ -41,7 +41,7 @@ def test_faster_and_smaller_are_how_many_times_less_it_takes():
     assert (back.faster, back.smaller) == pytest.approx((1 / 4, 1 / 5))
 
 
-def test_equal_lines_neither_gain_nor_lose():
+def test_equal_rows_neither_gain_nor_lose():
     cell = measurement_like(FULL, [RIGHT, WRONG, np.inf])
     found = compare_measurements("toy", [(cell, cell)])
     assert found.add_gain.low == found.add_gain.high == 0.0
@@ -59,7 +59,7 @@ def test_queries_are_compared_one_by_one():
     assert compare_measurements("toy", [(half, other)]).add_gain.high > 20.0
 
 
-def test_over_several_objects_every_query_counts_alike():
+def test_over_several_objects_all_queries_have_equal_weights():
     few = (
         measurement_like(FULL, [WRONG] * 2, map_bytes=100),
         measurement_like(DOMINATING, [RIGHT] * 2, map_bytes=50),
@@ -90,7 +90,7 @@ def test_a_query_counts_with_its_mean_over_draws():
     assert found.faster == pytest.approx(2.0)
 
 
-def test_every_line_stands_against_the_full_map_of_its_own_method_and_strategy():
+def test_each_row_is_compared_with_the_full_map_of_its_method_and_strategy():
     methods, strategies = ("sift", "aliked"), ("exhaustive", "direct")
     keys = [(m, s, v) for m in methods for s in strategies for v in ("full", "dominating", "random:8")]
     found = against_full([result_like("toy", *(measurement_like(key, [RIGHT]) for key in keys))])
@@ -100,7 +100,7 @@ def test_every_line_stands_against_the_full_map_of_its_own_method_and_strategy()
 
 
 @pytest.mark.parametrize("variant", ["default", "points:300"])
-def test_points_for_direct_matching_stand_against_exhaustive_matching_of_the_full_map(variant):
+def test_maps_for_direct_matching_are_compared_with_exhaustive_matching_of_the_full_map(variant):
     chosen = ("sift", "direct", variant)
     cells = [measurement_like(key, [RIGHT]) for key in (FULL, DIRECT, chosen)]
     (found,) = against_full([result_like("toy", *cells)])
@@ -110,7 +110,7 @@ def test_points_for_direct_matching_stand_against_exhaustive_matching_of_the_ful
     assert against_full([result_like("toy", cells[2])]) == []
 
 
-def test_the_line_over_all_objects_comes_first_where_there_are_several():
+def test_the_comparison_over_all_objects_comes_first():
     cells = measurement_like(FULL, [RIGHT] * 2), measurement_like(DOMINATING, [RIGHT] * 2)
     one, other = (result_like(name, *cells) for name in ("can", "mug"))
     assert [found.object for found in against_full([one, other])] == [BY_FRAME, "can", "mug"]
@@ -119,7 +119,7 @@ def test_the_line_over_all_objects_comes_first_where_there_are_several():
     assert [found.object for found in against_full([one, lonely])] == ["can"]
 
 
-def test_plain_values_say_which_is_which():
+def test_plain_values_name_both_rows():
     before, after = measurement_like(FULL, [WRONG]), measurement_like(DOMINATING, [RIGHT])
     values = compare_measurements("toy", [(before, after)]).to_json()
     assert values["before"] == {"method": "sift", "strategy": "exhaustive", "variant": "full"}
@@ -148,7 +148,7 @@ def runs():
     return run_like(*before, folder=Path("old")), run_like(*after, folder=Path("new"))
 
 
-def test_runs_are_compared_on_what_they_have_in_common(runs):
+def test_runs_are_compared_on_common_rows(runs):
     (found,) = compare_runs(*runs)
     assert (found.object, found.before, found.after) == ("can", FULL, FULL)
     assert (found.add_before, found.add_after) == (50.0, 100.0)
@@ -169,7 +169,7 @@ def test_a_run_equals_itself(runs):
     assert {one.p_value for one in found} == {one.faster for one in found} == {1.0}
 
 
-def test_runs_with_nothing_in_common_are_refused(runs):
+def test_runs_without_common_rows_are_an_error(runs):
     before, after = runs
-    with pytest.raises(InputError, match=r"old and new: have no object with the same queries"):
+    with pytest.raises(InputError, match=r"old and new: the runs have no row in common"):
         compare_runs(before, replace(after, objects=after.objects[1:]))

@@ -68,7 +68,7 @@ def tables_in(text):
     return [block.splitlines() for block in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE)]
 
 
-def test_every_line_of_a_markdown_table_has_as_many_cells(run, rows, comparisons):
+def test_every_line_of_a_markdown_table_has_the_same_number_of_cells(run, rows, comparisons):
     texts = {
         markdown_table(rows): len(rows),
         markdown_comparisons(comparisons): len(comparisons),
@@ -93,7 +93,7 @@ def test_markdown_shows_values_with_the_interval_of_the_accuracy(run):
     assert shown_values["FPS"] == "28.6"
 
 
-def test_what_has_no_value_is_a_dash(rows):
+def test_a_missing_value_is_a_dash(rows):
     (lines,) = tables_in(markdown_table(rows))
     header = cells_of(lines[0])
     rows = [dict(zip(header, cells_of(line), strict=True)) for line in lines[2:]]
@@ -101,14 +101,14 @@ def test_what_has_no_value_is_a_dash(rows):
     assert DASH not in {row["5°-5cm"] for row in rows if row["Object"].startswith("0408")}
 
 
-def test_without_a_metric_object_there_are_no_columns_of_centimetres(run):
+def test_without_a_metric_object_there_are_no_centimeter_columns(run):
     rows = rows_of(run.objects[1])
     assert not is_metric(rows)
     assert "cm" not in markdown_table(rows)
     assert "cm" not in latex_table(rows, "toys")
 
 
-def test_comparisons_tell_direction_and_doubt(run):
+def test_comparisons_show_direction_and_uncertainty(run):
     (lines,) = tables_in(markdown_comparisons(against_full(run.objects[:1])))
     first = dict(zip(cells_of(lines[0]), cells_of(lines[2]), strict=True))
     assert first["Row"] == "sift, exhaustive, dominating"
@@ -119,14 +119,14 @@ def test_comparisons_tell_direction_and_doubt(run):
     assert first["smaller"] == f"24000.0{TIMES}"
 
 
-def test_small_probabilities_are_not_called_zero():
+def test_small_probabilities_are_not_rounded_to_zero():
     assert [format_p_value(value) for value in (1.0, 0.05, 0.001, 0.00099, 0.0)] == [
         *("1.000", "0.050", "0.001"),
         *("< 0.001", "< 0.001"),
     ]
 
 
-def test_intervals_are_shown_where_there_are_some(run):
+def test_a_value_without_an_interval_is_shown_alone(run):
     row = rows_of(run.objects[0])[0]
     assert format_value(row, MAP_COLUMNS[0], interval=True) == "1,234"
 
@@ -174,7 +174,7 @@ def test_latex_is_balanced_and_has_the_columns_of_the_papers_table(run):
     assert "\\caption{TinyDataset toys\\_2}" in latex
 
 
-def test_latex_escapes_what_it_would_take_for_commands(rows):
+def test_latex_escapes_special_characters(rows):
     latex = latex_table(rows, "50 % of 3° at _")
     assert_balanced(latex)
     assert r"0408\_box \& 50\%|\{x\}\textasciitilde{}\^{}\$\#\textbackslash{}: sift" in latex
@@ -183,7 +183,7 @@ def test_latex_escapes_what_it_would_take_for_commands(rows):
     assert not re.search(r"(?<!\\)[%#]|(?<!\\)_", latex)
 
 
-def test_latex_rules_part_objects_and_name_slim_maps(rows):
+def test_latex_separates_objects_with_rules_and_names_variants(rows):
     latex = latex_table(rows, "toys")
     assert latex.count("\\midrule") == 1 + (4 - 1)  # below the header; two averages and two objects
     assert "mug: sift, exhaustive &" in latex
@@ -225,7 +225,7 @@ def test_without_objects_there_are_no_queries():
     assert csv_queries([]) == "\n"
 
 
-def test_the_page_tells_all(run, rows, comparisons):
+def test_the_page_has_all_tables(run, rows, comparisons):
     page = markdown_page(run, rows, comparisons)
     assert page.startswith("# TinyDataset toys\n")
     assert "**jar failed**: jar/box3d_corners.txt is missing" in page
@@ -246,7 +246,7 @@ def test_sizes_of_dominating_sets_are_shown(run):
     assert cells_of(lines[2]) == ["sift", "2", "2", "3.00", "4", "0.150", "0.150", "0.325", "0.325"]
 
 
-def test_counts_and_sizes_are_written_in_the_unit_that_suits_them():
+def test_counts_and_sizes_have_a_suitable_unit():
     assert [format_number(value) for value in (7.0, 12_345.0, 3.25)] == ["7", "12,345", "3.2"]
     assert [format_bytes(value) for value in (0, 999, 1000, 9_949, 24e6, 999.6e6, 5e12)] == [
         *("0 B", "999 B", "1.0 kB", "9.9 kB", "24 MB", "1.0 GB", "5000 GB"),

@@ -26,7 +26,7 @@ def localization(pose=None, *, confidence=None, references=3, seconds=(0.01, 0.0
     )
 
 
-def test_entry_i_of_everything_is_of_query_i():
+def test_entry_i_of_each_field_belongs_to_query_i():
     shift = rigid(translation=(0, 0, 0.1))
     found = [
         localization(shift, confidence=0.75, references=7, seconds=(1.0, 2.0, 3.0)),
@@ -45,7 +45,7 @@ def test_entry_i_of_everything_is_of_query_i():
     assert [pose is None for pose in outcomes.cam_from_world] == [False, True, False]
 
 
-def test_where_there_is_a_model_its_vertices_are_measured():
+def test_errors_use_the_vertices_of_a_model():
     half_a_turn = rigid(angle_deg=180.0)
     pair = ObjectModel(vertices=np.array([[1.0, 0, 0], [-1.0, 0, 0]]), diameter=2.0, symmetric=True)
     outcomes = outcomes_of([localization(half_a_turn)], [rigid()], BOX, pair)
@@ -53,20 +53,22 @@ def test_where_there_is_a_model_its_vertices_are_measured():
     assert outcomes.rotation_deg == pytest.approx([180])
 
 
-def test_there_must_be_queries_each_with_its_truth():
+def test_there_must_be_queries_each_with_a_true_pose():
     with pytest.raises(ValueError, match="at least one query"):
         outcomes_of([], [], BOX)
     with pytest.raises(ValueError, match="zip"):
         outcomes_of([localization()], [], BOX)
+    with pytest.raises(ValueError, match="zip"):
+        outcomes_of([localization(rigid()), localization(rigid())], [rigid()], BOX)
 
 
-def test_every_field_is_of_as_many_queries():
+def test_all_fields_have_the_same_length():
     two = outcomes_like([0.1, 0.2])
-    with pytest.raises(ValueError, match="as many queries"):
+    with pytest.raises(ValueError, match="the same number of queries"):
         replace(two, cam_from_world=two.cam_from_world[:1])
 
 
-def test_joined_outcomes_stand_one_after_the_other():
+def test_joined_outcomes_are_concatenated():
     first, second = outcomes_like([0.1, np.inf]), outcomes_like([0.3], references=8)
     both = join_outcomes([first, second])
     assert both.error.tolist() == [0.1, np.inf, 0.3]

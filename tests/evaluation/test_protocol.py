@@ -40,7 +40,7 @@ def test_outcomes_come_in_the_order_of_the_queries(narrow, queries, strategy):
 
 
 @pytest.mark.parametrize("strategy", CLASSICAL)
-def test_no_query_is_refused(narrow, strategy):
+def test_no_query_is_an_error(narrow, strategy):
     with pytest.raises(ValueError, match="queries must hold at least one"):
         localize_all(narrow, [], strategy)
 
@@ -65,7 +65,7 @@ def test_queries_that_cannot_be_localized_stay_in_their_place(narrow, queries):
     assert [pose is None for pose in outcomes.cam_from_world].index(True) == 3
 
 
-def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
+def test_preparing_uses_the_extractor_of_the_map(boulder):
     map_, queries = boulder.map, queries_of(boulder.mapping)[:3]
     for query, prepared in zip(queries, prepare_queries(map_, queries), strict=True):
         stored = map_.features[query.path.name]

@@ -74,7 +74,7 @@ def same_bits(a, b):
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
-def test_what_is_read_is_to_the_bit_what_was_written(run, written):
+def test_reading_returns_the_written_values_bit_for_bit(run, written):
     found = read_run(written.parent)
     assert digest_of(found.objects) == digest_of(run.objects)
     assert run_to_json(found) == run_to_json(run)
@@ -95,7 +95,7 @@ def assert_equal_outcomes(a, b):
             assert same_bits(one.translation, other.translation)
 
 
-def test_everything_else_comes_back_too(run, written):
+def test_reading_returns_all_other_fields(run, written):
     found = read_run(written)  # the file does as well as its folder
     assert found.folder == run.folder
     for name in ("dataset", "options", "environment", "failed"):
@@ -120,7 +120,7 @@ def test_the_file_is_strict_json_in_which_no_pose_is_null(run, written):
     assert [value is None for value in trial["confidence"]] == np.isnan(outcomes.confidence).tolist()
 
 
-def test_the_digest_is_of_poses_and_maps_alone(run):
+def test_the_digest_depends_only_on_poses_and_maps(run):
     (can, mug), before = run.objects, digest_of(run.objects)
 
     def changed(**fields):
@@ -144,12 +144,12 @@ def with_outcomes(result, **fields):
     return replace(result, measurements=(replace(cell, map_runs=(trial,)), *result.measurements[1:]))
 
 
-def test_a_single_object_comes_back_too(run, tmp_path):
+def test_a_single_object_can_be_read(run, tmp_path):
     write_json(tmp_path / "can.json", object_to_json(run.objects[0]))
     assert digest_of([read_object_result(tmp_path / "can.json")]) == digest_of(run.objects[:1])
 
 
-def test_infinite_numbers_are_refused_and_what_stood_there_stays(tmp_path):
+def test_infinite_numbers_are_an_error_and_the_old_file_stays(tmp_path):
     write_json(tmp_path / "x.json", {"a": 1.0})
     with pytest.raises(ValueError, match="JSON"):
         write_json(tmp_path / "x.json", {"a": np.inf})
@@ -207,25 +207,25 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
-def test_damaged_results_are_named(written, damage):
+def test_damaged_results_are_named_in_the_error(written, damage):
     written.write_text(damage(written.read_text()))
-    with pytest.raises(InputError, match=r"results\.json: is no result of slimsfm benchmark \(.*; run"):
+    with pytest.raises(InputError, match=r"results\.json: not a result of slimsfm benchmark \(.*; run"):
         read_run(written.parent)
 
 
-def test_results_that_are_no_text_are_named(written):
+def test_binary_results_are_named_in_the_error(written):
     written.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match=r"results\.json: is no result"):
+    with pytest.raises(InputError, match=r"results\.json: not a result"):
         read_run(written)
 
 
-def test_results_of_another_format_are_named(written):
+def test_results_of_another_format_are_named_in_the_error(written):
     written.write_text(put(2, "format")(written.read_text()))
-    with pytest.raises(InputError, match=r"results\.json: is of format 2, this reads 1; run it again"):
+    with pytest.raises(InputError, match=r"results\.json: has format 2, expected 1; run the benchmark again"):
         read_run(written)
 
 
-def test_missing_results_are_named(tmp_path):
+def test_missing_results_are_named_in_the_error(tmp_path):
     for given in (tmp_path, tmp_path / "nothing", tmp_path / "nothing.json"):
-        with pytest.raises(InputError, match="no such file; give the folder of a run of slimsfm benchmark"):
+        with pytest.raises(InputError, match="no such file; pass the folder of a run of slimsfm benchmark"):
             read_run(given)

@@ -24,7 +24,7 @@ def with_ends(shares):
 
 @pytest.mark.parametrize("unit", ["metre", "unknown"])
 @pytest.mark.parametrize("errors", [[0.01, 0.03], [0.01, np.inf], [np.inf, np.inf]], ids=str)
-def test_a_row_is_plain_json_of_the_documented_keys(unit, errors):
+def test_a_row_is_plain_json_with_the_documented_keys(unit, errors):
     (row,) = rows_of(result_like("toy", measurement_like(FULL, errors), unit=unit))
     values = json.loads(json.dumps(row.to_json(), allow_nan=False))
     shares = SHARES | METRIC_SHARES if unit == "metre" else SHARES
@@ -57,12 +57,12 @@ def test_an_infinite_median_has_no_value():
     assert median([0.01, 0.02, np.inf]) == 0.02
 
 
-def test_rows_stand_in_the_order_of_the_lines():
+def test_rows_have_the_order_of_the_measurements():
     result = result_like("toy", measurement_like(DOMINATING, [0.1]), measurement_like(FULL, [0.1]))
     assert [row.variant for row in rows_of(result)] == ["dominating", "full"]
 
 
-def test_intervals_hold_the_values():
+def test_intervals_contain_the_values():
     errors = np.random.default_rng(0).lognormal(-3, 1, 60)
     errors[::7] = np.inf
     seconds = np.random.default_rng(1).lognormal(-4, 1, (60, 3))
@@ -75,14 +75,14 @@ def test_intervals_hold_the_values():
     assert values["fps"] == pytest.approx(1 / seconds.sum(axis=1).mean())
 
 
-def test_intervals_are_narrow_where_all_queries_are_alike():
+def test_intervals_are_narrow_if_all_queries_are_alike():
     (row,) = rows_of(result_like("toy", measurement_like(FULL, [0.01] * 9)))
     values = row.to_json()
     assert values["add_0.1d_low"] == values["add_0.1d_high"] == 100.0
     assert values["fps_low"] == pytest.approx(values["fps_high"])
 
 
-def test_several_draws_are_one_row_of_their_mean():
+def test_several_draws_are_averaged_into_one_row():
     draws = [[0.01, 0.01, np.inf], [0.01, np.inf, np.inf]]
     cell = measurement_like(RANDOM, *draws)
     (row,) = rows_of(result_like("toy", cell))
@@ -92,7 +92,7 @@ def test_several_draws_are_one_row_of_their_mean():
     assert mean_over_draws(cell, np.isfinite(cell.outcomes.error)).tolist() == [1.0, 0.5, 0.0]
 
 
-def test_draws_do_not_make_more_queries_of_them():
+def test_draws_do_not_increase_the_number_of_queries():
     """Five equal draws tell no more than one: the interval stays as wide."""
     errors = [0.01, 0.01, 0.01, np.inf]
     (once,) = rows_of(result_like("toy", measurement_like(RANDOM, errors)))
@@ -123,7 +123,7 @@ def unequal():
     return [result_like("few", few), result_like("many", many)]
 
 
-def test_by_frame_every_query_counts_alike(unequal):
+def test_by_frame_all_queries_have_equal_weights(unequal):
     by_frame = average_rows(unequal)[0]
     assert by_frame.object == BY_FRAME
     assert by_frame.scores.queries == 8
@@ -133,7 +133,7 @@ def test_by_frame_every_query_counts_alike(unequal):
     assert by_frame.scores.seconds.total == pytest.approx((2 * 0.4 + 6 * 0.2) / 8)
 
 
-def test_by_object_every_object_counts_alike(unequal):
+def test_by_object_all_objects_have_equal_weights(unequal):
     by_object = average_rows(unequal)[1]
     assert by_object.object == BY_OBJECT
     assert by_object.scores.queries == 8
@@ -148,7 +148,7 @@ def test_maps_are_averaged_over_objects_either_way(unequal):
         assert (row.references, row.points, row.map_bytes) == (5.0, 20.0, 200.0)
 
 
-def test_intervals_of_averages_hold_the_averages_and_weigh_as_they_do(unequal):
+def test_intervals_of_averages_contain_the_averages_and_use_the_same_weights(unequal):
     """Only the two queries of one object are in doubt: by frame they weigh a quarter, by object a half."""
     by_frame, by_object = (row.to_json() for row in average_rows(unequal))
     for row in (by_frame, by_object):
@@ -170,7 +170,7 @@ def test_averages_over_draws_count_each_query_once():
     assert by_object.scores.add[0.1] == pytest.approx((25 + 100) / 2)
 
 
-def test_a_line_is_averaged_over_the_objects_that_have_it(unequal):
+def test_a_row_is_averaged_over_the_objects_that_have_it(unequal):
     extra = measurement_like(DOMINATING, [0.01, 0.01])
     objects = [result_like("few", *unequal[0].measurements, extra), unequal[1]]
     rows = average_rows(objects)
@@ -184,7 +184,7 @@ def test_one_object_has_no_averages(unequal):
     assert average_rows(unequal[:1]) == []
 
 
-def test_an_object_of_unknown_unit_leaves_averages_without_centimetres(unequal):
+def test_an_object_of_unknown_unit_removes_centimeters_from_averages(unequal):
     unknown = result_like("unknown", measurement_like(FULL, [0.01]), unit="unknown")
     assert all(row.scores.deg_cm is None for row in average_rows([*unequal, unknown]))
     assert all(row.scores.deg_cm is not None for row in average_rows(unequal))

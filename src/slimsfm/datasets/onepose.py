@@ -173,8 +173,8 @@ def read_object(directory: Path, *, frame_step: int = 1, frames: FrameKind = "fu
     sequences = [path for path in folders(directory) if re.search(r"-\d+$", path.name)]
     if len(sequences) < 2:
         raise InputError(
-            f"{directory} holds {len(sequences)} of the sequences NAME-1, NAME-2, ...: two are required, one for "
-            "mapping and one for queries"
+            f"{directory} holds {len(sequences)} of the sequences NAME-1, NAME-2, ...: two are required, "
+            "one for mapping and one for queries"
         )
     mapping, query = (read_sequence(sequences[k], frame_step=frame_step, frames=frames) for k in (0, -1))
     return ObjectSequences(name=directory.name, mapping=mapping, query=query, box=box)

@@ -1,5 +1,4 @@
-"""Shared helpers of the data set readers: they check each file as they read it, and every error names the
-file.
+"""Shared helpers of the data set readers: they check each file, and every error names the file.
 
 Intrinsic matrices in files follow OpenCV, where the center of the top-left pixel is at (0, 0). So COLMAP's cx
 is the value in the file plus 0.5; `pinhole_camera` adds it for all data sets.

@@ -99,9 +99,7 @@ def markdown_summaries(summaries: Sequence[DominationSummary]) -> str:
 
 
 def latex_table(rows: Sequence[Row], caption: str) -> str:
-    """The paper's table for the LaTeX package booktabs, with rules between objects, methods and
-    strategies.
-    """
+    """The paper's table in LaTeX (booktabs), with rules between objects, methods and strategies."""
     shown_columns = paper_columns(metric=is_metric(rows))
     header = " & ".join(["Method", *(_latex(column.title) for column in shown_columns)])
     groups = [list(group) for _, group in groupby(rows, key=lambda row: row_labels(row)[:3])]

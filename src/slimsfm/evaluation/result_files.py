@@ -228,7 +228,8 @@ def read_run(folder: Path) -> Run:
         data = json.loads(path.read_text(encoding="utf-8"))
         if data["format"] != RESULT_FORMAT_VERSION:
             raise InputError(
-                f"{path}: has format {data['format']}, expected {RESULT_FORMAT_VERSION}; run the benchmark again"
+                f"{path}: has format {data['format']}, expected {RESULT_FORMAT_VERSION}; "
+                "run the benchmark again"
             )
         return Run(
             folder=path.parent,

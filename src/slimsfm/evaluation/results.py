@@ -1,6 +1,4 @@
-"""What a benchmark measures: outcomes of queries, the maps of each object, and one measurement per table
-row.
-"""
+"""What a benchmark measures: outcomes of queries, maps of each object, one measurement per table row."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
