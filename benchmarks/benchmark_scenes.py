@@ -1,4 +1,4 @@
-"""The scenes that benchmarks share: folders of photos with every third held out, and rendered objects."""
+"""Scenes that benchmarks share: folders of photos with every third image held out, and rendered objects."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from slimsfm.progress import shown
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A map of references and queries that it knows nothing of."""
+    """A map and queries that are not in it."""
 
     name: str
     references: Map
@@ -27,7 +27,7 @@ class Scene:
 
 
 def scenes(folders: list[Path], objects: Sequence[str], output: Path) -> Iterator[Scene]:
-    """The folders of photos, then the rendered objects; what is made is kept in the output folder."""
+    """The folders of photos, then the rendered objects; results are stored in the output folder."""
     for folder in folders:
         with quiet():
             making = LoadOptions(folder=output / folder.name, progress=shown)
@@ -45,7 +45,7 @@ def scenes(folders: list[Path], objects: Sequence[str], output: Path) -> Iterato
 
 
 def rendered(name: str, output: Path) -> Scene:
-    """A rendered object, mapped from its known poses."""
+    """A rendered object, mapped with its known poses."""
     if not (output / "objects" / name).exists():
         synthesize(output / "objects", SynthesisOptions(objects=(name,)), progress=shown)
     made = read_object(output / "objects" / name)

@@ -1,8 +1,8 @@
-"""The scenes that deceive, for benchmarks to share: rendered and mapped once, kept in the output folder.
+"""Deceptive scenes that benchmarks share: rendered and mapped once, stored in the output folder.
 
     python benchmarks/deceptive_scenes.py -o /tmp/deceptions
 
-shows how the exhaustive strategy fares in each.
+Prints the scores of the exhaustive strategy for each scene.
 """
 
 import argparse
@@ -37,13 +37,13 @@ Job = TypeVar("Job")
 
 
 def deceptions(output: Path, *, workers: int = 1) -> Iterator[Scene]:
-    """Every deception, mapped from its known poses, with its queries."""
+    """Every deception, mapped with its known poses, with its queries."""
     for name in DECEPTIONS:
         yield deception(name, output, workers=workers)
 
 
 def deception(name: str, output: Path, *, workers: int = 1) -> Scene:
-    """One deception; what is in the output folder already is not made again."""
+    """One deception; existing files in the output folder are reused."""
     folder, path = output / "deceptions" / name, output / f"{name}-map"
     if not folder.exists():
         with replacing(folder, overwrite=False) as partial:
@@ -79,7 +79,7 @@ def run_all(function: Callable[[Job], None], jobs: Sequence[Job], label: str, wo
 
 @lru_cache(maxsize=1)
 def take(name: str, kind: str) -> Take:
-    """One take of a deception; the last one is remembered."""
+    """One take of a deception; the last one is cached."""
     return getattr(DECEPTIONS[name], kind)(FRAMES, WIDTH, HEIGHT, SEED)
 
 

@@ -1,10 +1,10 @@
-"""The paper's four methods on a rendered object: full map, dominating set, random set; time by stage.
+"""The four methods of the paper on a rendered object: full map, dominating set, random set; time by stage.
 
     python benchmarks/paper_methods.py -o OUT [--weights WEIGHTS] [--object boulder] [--queries 4]
 
-Weights that are not in WEIGHTS are seeded random ones. Untrained networks find no matches to build a map
-from, so the map then is the object's SIFT map, its keypoints described by the method. With random weights
-just times mean something, and no accuracy is printed.
+Weights that are not in WEIGHTS are random with a fixed seed. Untrained networks find no matches to build a
+map from, so the map is then the SIFT map of the object with descriptors of the method at its keypoints. With
+random weights only times are meaningful, and no accuracy is printed.
 """
 
 import argparse
@@ -43,7 +43,7 @@ from slimsfm.weights import FOLDER, WEIGHTS
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """One of the paper's four methods."""
+    """One of the four methods of the paper."""
 
     name: str
     strategy: str
@@ -115,7 +115,7 @@ def main() -> None:
 
 
 def _weights(folder: Path, given: Path | None) -> set[str]:
-    """Fill a folder with random weights and what is given over them; which weights are given."""
+    """Fill a folder with random weights, then with the given ones; return the names of the given ones."""
     write_random_weights(folder)
     found = {name for name, one in WEIGHTS.items() if given and (given / one.file).is_file()}
     for name in found:
@@ -132,7 +132,7 @@ def _built(made: ObjectSequences, method: Method) -> Map:
 
 
 def _described(map_: Map, made: ObjectSequences, extractor: str) -> Map:
-    """The map with its keypoints described by another method."""
+    """The map with descriptors of another method at its keypoints."""
     photos = {path.name: read_image(path) for path in made.mapping.image_paths if path.name in map_.images}
     describe = _by_superpoint() if extractor == "superpoint" else _by_loftr()
     features = {
@@ -166,7 +166,7 @@ def _by_loftr() -> Describe:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """How one method does on one variant of a map."""
+    """Results of one method on one variant of a map."""
 
     references: float
     points: float
@@ -196,7 +196,7 @@ def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count:
 
 
 def _with_boxes(map_: Map, queries: list[PreparedQuery], strategy: str, _matcher: str) -> Outcomes:
-    """Localize queries near their true poses, after one that is not timed."""
+    """Localize queries near their true poses, after one without timing."""
     localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
     found = [
         localizer.localize_near(read_image(one.path), one.camera, one.cam_from_world)
