@@ -21,7 +21,7 @@ def truth():
 
 @pytest.fixture
 def project(tmp_path, truth, write_image):
-    """A COLMAP project called cup, with hloc's features beside."""
+    """A COLMAP project called cup, with hloc's features next to it."""
     model = tmp_path / "cup" / "sparse" / "0"
     model.mkdir(parents=True)
     truth.model.write(model)
@@ -86,9 +86,9 @@ def test_a_file_lists_the_queries(project, truth, making, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("002.png\n099.png\n", "lists '099.png', of which the model has no pose"),
-        ("", "lists 0 of the model's 9 images"),
-        ("".join(f"{k:03d}.png\n" for k in range(1, 9)), "lists 8 of the model's 9 images"),
+        ("002.png\n099.png\n", "lists '099.png', which has no pose in the model"),
+        ("", "lists 0 of the 9 images"),
+        ("".join(f"{k:03d}.png\n" for k in range(1, 9)), "lists 8 of the 9 images"),
         (None, "there is no such file"),
         (b"\xff\xfe\xff", "cannot be read"),
     ],

@@ -55,7 +55,7 @@ def test_unregistered_photos_are_logged_and_left_out(reconstructed, tmp_path, ca
     with caplog.at_level(logging.WARNING, logger="slimsfm"):
         again = replace(dataset, path=more).load("box", making)
     assert [record.getMessage() for record in caplog.records] == [
-        f"{more}: not in the model and so left out: 8.png"
+        f"{more}: not registered and so left out: 8.png"
     ]
     assert again.mapping.names == made.mapping.names
 

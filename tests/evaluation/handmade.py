@@ -1,4 +1,4 @@
-"""Results made by hand, for tests of what is computed from them."""
+"""Handmade results as input for tests."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def random_pose(rng):
 
 
 def outcomes_like(errors, *, confidence=0.95, references=3, seconds=(0.01, 0.02, 0.005)):
-    """Outcomes with these relative errors, a hundred times as many degrees, and as many metres."""
+    """Outcomes with these relative errors, also as meters, and times 100 as degrees."""
     errors = np.array(errors, np.float64)
     found = np.isfinite(errors)
     return Outcomes(
@@ -44,14 +44,14 @@ def map_run_like(errors, *, references=4, points=100, map_bytes=1000, **how):
 
 
 def measurement_like(key, *draws, **how):
-    """One line, each draw a list of errors."""
+    """One measurement; each draw is a list of errors."""
     method, strategy, variant = key
     trials = tuple(map_run_like(errors, **how) for errors in draws)
     return Measurement(method=method, strategy=strategy, variant=variant, map_runs=trials)
 
 
 def result_like(name, *cells, unit="metre", queries=None):
-    """An object of these lines."""
+    """An object with these measurements."""
     count = len(cells[0].map_runs[0].outcomes)
     names = queries or [f"{number}.png" for number in range(count)]
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)

@@ -29,7 +29,7 @@ def test_a_better_row_gains_and_a_worse_row_loses():
 
 
 def test_faster_and_smaller_are_ratios():
-    """Extraction does not count: it is the same for both."""
+    """Extraction does not count, because it is the same for both."""
     before = measurement_like(FULL, [RIGHT] * 3, seconds=(9.0, 0.3, 0.1), map_bytes=5000)
     after = measurement_like(DOMINATING, [RIGHT] * 3, seconds=(1.0, 0.05, 0.05), map_bytes=1000)
     found = compare_measurements("toy", [(before, after)])
@@ -49,7 +49,7 @@ def test_equal_rows_neither_gain_nor_lose():
 
 
 def test_queries_are_compared_one_by_one():
-    """Half are right with either map: the same ones leave no doubt, others do."""
+    """Half are correct with either map; only if they differ, the interval has a width."""
     half = measurement_like(FULL, [RIGHT, WRONG] * 10)
     same, other = (
         measurement_like(DOMINATING, [RIGHT, WRONG] * 10),
@@ -130,7 +130,7 @@ def test_plain_values_name_both_rows():
 
 @pytest.fixture
 def runs():
-    """Two runs: `can` has equal queries in both and one line in common, `mug` has others, `jar` is in one."""
+    """Two runs: `can` has equal queries and one common row, `mug` has other queries, `jar` is in one run."""
     slow, quick = {"seconds": (0.1, 0.4, 0.0)}, {"seconds": (0.1, 0.1, 0.0)}
     before = [
         result_like(

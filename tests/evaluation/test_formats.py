@@ -36,7 +36,7 @@ AWKWARD = "0408_box & 50%|{x}~^$#\\"
 
 @pytest.fixture(scope="module")
 def run():
-    """An object in centimetres whose name is awkward, one of unknown scale, and one that failed."""
+    """A metric object with an awkward name, one of unknown scale, and one that failed."""
     cells = [
         measurement_like(FULL, [0.01, 0.02, np.inf], references=1234, map_bytes=24_000_000),
         measurement_like(DOMINATING, [0.01, 0.2, 0.03]),
@@ -57,7 +57,7 @@ def comparisons(run):
 
 
 def cells_of(line):
-    """The cells of a line of a Markdown table; an escaped bar parts none."""
+    """The cells of a line of a Markdown table; an escaped bar is not a separator."""
     assert line.startswith("|")
     assert line.endswith("|")
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]

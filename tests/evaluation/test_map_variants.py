@@ -12,7 +12,7 @@ from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_imag
 
 @pytest.fixture(scope="module")
 def narrow():
-    """Ten images, none of which sees all of the points."""
+    """Ten images; no image sees all points."""
     return exact_map(num_images=10, num_points=400, reach_deg=65.0)
 
 
@@ -29,7 +29,7 @@ def making(narrow):
 
 
 def chosen(making, text):
-    """Indices of the images that the one map of a variant keeps."""
+    """Indices of the images in the only map of a variant."""
     (made,) = parse_variant(text).make(making)
     return [making.graph.names.index(name) for name in made.images]
 
@@ -99,7 +99,7 @@ def test_the_dominating_variant_is_the_given_solution(making):
 
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_a_set_that_dominates_k_times_localizes_each_other_image_from_k(making, k):
-    """Or from all that can, where there are fewer."""
+    """Or from all images that can, if there are fewer."""
     found, adjacency = chosen(making, f"dominating:k={k}"), making.graph.adjacency().toarray()
     np.fill_diagonal(adjacency, val=False)
     others = np.setdiff1d(np.arange(len(adjacency)), found)
@@ -113,7 +113,7 @@ def test_a_budget_is_respected(making):
 
 
 def test_a_stricter_threshold_takes_more_images(making):
-    """On an exact scene errors are rounding alone: no image localizes another that well."""
+    """In an exact scene errors are only rounding, but still larger than this threshold."""
     assert len(chosen(making, "dominating:threshold=1e-12")) == 10
 
 

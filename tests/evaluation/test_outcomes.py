@@ -39,7 +39,7 @@ def test_entry_i_of_each_field_belongs_to_query_i():
     assert outcomes.rotation_deg.tolist() == [0.0, np.inf, 0.0]
     assert outcomes.translation == pytest.approx([0.1, np.inf, 0.0])
     assert outcomes.confidence[0] == 0.75
-    assert np.isnan(outcomes.confidence[1:]).all()  # no pose, and none that anybody verified
+    assert np.isnan(outcomes.confidence[1:]).all()  # no pose, or no confidence
     assert outcomes.references.tolist() == [7, 0, 2]
     assert outcomes.seconds.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
     assert [pose is None for pose in outcomes.cam_from_world] == [False, True, False]

@@ -20,7 +20,7 @@ def narrow():
 
 @pytest.fixture
 def queries(narrow, tmp_path):
-    """The references themselves, whose features are known and so need no file."""
+    """The references as queries; their features are known, so no file is needed."""
     return [
         PreparedQuery(
             query=PosedQuery(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
@@ -46,7 +46,7 @@ def test_no_query_is_an_error(narrow, strategy):
 
 
 def test_queries_that_cannot_be_localized_stay_in_their_place(narrow, queries):
-    """Of a query that sees nothing of the map nothing is found, and the others do not mind."""
+    """A query without any match to the map fails, and the others are not affected."""
     rng = np.random.default_rng(0)
     lost = queries[3].features
     strange = rng.normal(size=lost.descriptors.shape).astype(np.float32)

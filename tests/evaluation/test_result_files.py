@@ -38,7 +38,7 @@ def random_outcomes(rng):
 
 @pytest.fixture
 def run(tmp_path):
-    """A run whose numbers have all their digits."""
+    """A run with random numbers of full precision."""
     rng = np.random.default_rng(0)
     draws = tuple(
         MapRun(references=3, points=17, map_bytes=4711, outcomes=random_outcomes(rng)) for _ in range(2)
@@ -96,7 +96,7 @@ def assert_equal_outcomes(a, b):
 
 
 def test_reading_returns_all_other_fields(run, written):
-    found = read_run(written)  # the file does as well as its folder
+    found = read_run(written)  # the file works as well as its folder
     assert found.folder == run.folder
     for name in ("dataset", "options", "environment", "failed"):
         assert getattr(found, name) == getattr(run, name)

@@ -23,7 +23,7 @@ SPANS = {"can": range(2, 10), "mug": range(14, 22)}
 
 
 def write_object(root, name, boulder):
-    """Eight neighbouring frames of the rendered object, two of them queries."""
+    """Eight neighboring frames of the rendered object, two of them queries."""
     images = [f"{number}.png" for number in SPANS[name]]
     queries = [images[2], images[5]]
     add_object(root, name, boulder.map, boulder.photos, queries, [x for x in images if x not in queries])
@@ -39,13 +39,13 @@ def dataset(boulder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(dataset, tmp_path_factory):
-    """A run that nothing interrupted."""
+    """A run without interruption."""
     return run_benchmark(dataset, bench_in(tmp_path_factory.mktemp("whole") / "run"))
 
 
 @pytest.fixture
 def breakable(dataset, tmp_path):
-    """The data set at a place of its own, where its objects may be broken."""
+    """A copy of the data set, whose objects may be broken."""
     shutil.copytree(dataset.path, tmp_path / "data")
     return TinyDataset(path=tmp_path / "data")
 
@@ -64,7 +64,7 @@ def mend(dataset, name):
 
 
 def without_time(path):
-    """The result of an object but for times; what differs is then what was found."""
+    """The result of an object without times."""
 
     def strip(value):
         if isinstance(value, dict):
@@ -75,7 +75,7 @@ def without_time(path):
 
 
 def state_of(folder, name):
-    """All that a run keeps of an object, and when it was written."""
+    """The files of an object in a run, and their modification times."""
     maps = folder / "maps" / name
     paths = [object_path(folder, name), *sorted(maps.rglob("*"))]
     return contents(maps), object_path(folder, name).read_bytes(), [one.stat().st_mtime_ns for one in paths]
@@ -250,7 +250,7 @@ def test_overwrite_continues_a_run_with_the_same_options(whole, dataset):
 def test_a_folder_with_other_files_is_an_error(dataset, tmp_path, content):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / content).write_text("mine")
-    for overwrite in (False, True):  # what is no run is nobody's to delete
+    for overwrite in (False, True):  # other files are never deleted
         with pytest.raises(OutputError, match="exists already and is not a run"):
             run_benchmark(dataset, bench_in(tmp_path / "run"), overwrite=overwrite)
     assert contents(tmp_path / "run") == {content: b"mine"}
@@ -288,7 +288,7 @@ def test_leftovers_of_a_killed_process_are_ignored(dataset, tmp_path):
 def test_maps_of_an_object_that_failed_are_not_used_again(breakable, tmp_path):
     told = breakable.path / NAMES[0] / "object.json"
     gone = json.loads(told.read_text()) | {"photos": "nowhere"}
-    told.write_text(json.dumps(gone))  # found out when the object is mapped already
+    told.write_text(json.dumps(gone))  # detected only after mapping
     bench = bench_in(tmp_path / "run")
     assert "nowhere" in run_benchmark(breakable, bench).failed[NAMES[0]]
     assert [path.name for path in (bench.folder / "maps").iterdir()] == [NAMES[1]]

@@ -7,7 +7,7 @@ from slimsfm.evaluation.scores import criteria, mean_scores, score
 
 
 def test_scores_sum_up_mixed_outcomes():
-    """Errors as relative, hundredfold as degrees, and as metres."""
+    """Relative errors, also as meters, and times 100 as degrees."""
     quick, slow = (0.01, 0.02, 0.005), (0.06, 0.12, 0.005)
     found = [outcomes_like([0.005, 0.03, 0.2, np.inf], seconds=quick), outcomes_like([np.inf], seconds=slow)]
     scores = score(join_outcomes(found), metric=True)
@@ -78,7 +78,7 @@ def test_means_weigh_objects_equally_and_use_the_median_of_medians():
     assert mean.add == pytest.approx({0.1: 200 / 3, 0.05: 200 / 3, 0.02: 100 / 3})
     assert mean.deg_cm == pytest.approx({1: 100 / 3, 3: 200 / 3, 5: 200 / 3})
     assert mean.median_error == pytest.approx(0.03)
-    assert mean.confidence_wrong == 0.0  # of the two that have poses to be sure of
+    assert mean.confidence_wrong == 0.0  # over the two that have sure poses
     assert mean.references_tried == 4.0
     assert mean.seconds.match == pytest.approx(0.05)
     assert mean.fps == pytest.approx(1 / 0.07)

@@ -6,12 +6,12 @@ from slimsfm.evaluation.scores import bootstrap, paired_p_value
 
 
 def means(found):
-    """The figures are the means themselves, of the one group there is."""
+    """The figures are the means of the only group."""
     return found[:, 0, :]
 
 
 def test_intervals_agree_with_scipy_on_skewed_values():
-    """Both are by chance: at 9999 draws an end is known to about 3 % of the mean's standard error."""
+    """Both are random: with 9999 draws an end has an error of about 3 % of the standard error of the mean."""
     rng = np.random.default_rng(3)
     for n in (10, 60, 300):
         values = rng.lognormal(sigma=1.2, size=n)
@@ -26,7 +26,7 @@ def test_intervals_agree_with_scipy_on_skewed_values():
 
 
 def test_each_group_is_resampled_on_its_own():
-    """Two objects of one sure outcome each: drawn together they would get mixed, here nothing varies."""
+    """Two objects with constant outcomes: resampled together they would mix, here nothing varies."""
     groups = [np.zeros((5, 1)), np.full((9, 1), 100.0)]
     (interval,) = bootstrap(groups, lambda found: found.mean(axis=1))
     assert interval.low == interval.high == 50.0
@@ -42,7 +42,7 @@ def test_the_variance_of_a_mean_over_groups_is_that_of_their_means():
 
 @pytest.mark.parametrize("draw", ["normal", "uniform", "exponential"])
 def test_about_95_percent_of_intervals_contain_the_true_mean(draw):
-    """Every column is one study of 60 queries; of skewed values the intervals are a little too short."""
+    """Every column is one study of 60 queries; for skewed values the intervals are slightly too short."""
     rng = np.random.default_rng(5)
     sample, truth = {
         "normal": (rng.normal(2.0, 1.0, (60, 400)), 2.0),
@@ -78,7 +78,7 @@ def test_equal_values_give_equal_intervals_and_the_order_of_figures_is_kept():
 
 @pytest.mark.parametrize("lost", range(14))
 def test_for_zeros_and_ones_the_test_is_mcnemars(lost):
-    """Only queries that differ count, and of these each side is as probable as the other."""
+    """Only differing queries count, and both signs are equally probable."""
     for won in range(14 - lost):
         a = np.array([1.0] * lost + [0.0] * won + [1.0, 0.0, 0.0])
         b = np.array([0.0] * lost + [1.0] * won + [1.0, 0.0, 0.0])
@@ -107,7 +107,7 @@ def test_equal_values_do_not_differ():
 
 
 def test_means_over_draws_that_cancel_out_do_not_differ():
-    """Fifths, as means over five draws are, whose sum is 0 but for rounding."""
+    """Means over five draws are fifths; their sum is 0 up to rounding."""
     a, b = np.array([0.6, 0.2, 0.8, 0.0]), np.array([0.0, 0.8, 0.2, 0.6])
     assert paired_p_value(a, b) == 1.0
     assert paired_p_value(b, a) == 1.0

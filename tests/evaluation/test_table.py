@@ -39,7 +39,7 @@ def test_a_row_is_plain_json_with_the_documented_keys(unit, errors):
 
 
 def test_a_row_counts_queries_in_percent():
-    """Errors as relative, a hundred times as many degrees, and as many metres."""
+    """Relative errors, also as meters, and times 100 as degrees."""
     (row,) = rows_of(result_like("toy", measurement_like(FULL, [0.001, 0.01, 0.025, 0.07, np.inf])))
     values = row.to_json()
     assert values["localized"] == 80.0
@@ -93,7 +93,7 @@ def test_several_draws_are_averaged_into_one_row():
 
 
 def test_draws_do_not_increase_the_number_of_queries():
-    """Five equal draws tell no more than one: the interval stays as wide."""
+    """Five equal draws carry no more information than one: the interval keeps its width."""
     errors = [0.01, 0.01, 0.01, np.inf]
     (once,) = rows_of(result_like("toy", measurement_like(RANDOM, errors)))
     (often,) = rows_of(result_like("toy", measurement_like(RANDOM, *[errors] * 5)))
@@ -113,7 +113,7 @@ def test_sizes_are_means_over_draws():
 
 @pytest.fixture
 def unequal():
-    """Two queries, of which one is right, and six, of which all are."""
+    """An object with one of two queries correct, and an object with six of six."""
     few = measurement_like(
         FULL, [0.01, np.inf], seconds=(0.1, 0.2, 0.1), references=2, points=10, map_bytes=100
     )
@@ -149,7 +149,7 @@ def test_maps_are_averaged_over_objects_either_way(unequal):
 
 
 def test_intervals_of_averages_contain_the_averages_and_use_the_same_weights(unequal):
-    """Only the two queries of one object are in doubt: by frame they weigh a quarter, by object a half."""
+    """Only the two queries of one object vary: by frame they weigh a quarter, by object a half."""
     by_frame, by_object = (row.to_json() for row in average_rows(unequal))
     for row in (by_frame, by_object):
         assert row["add_0.1d_low"] <= row["add_0.1d"] <= row["add_0.1d_high"]
