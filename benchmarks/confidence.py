@@ -1,11 +1,11 @@
-"""What a pose's confidence rests on: learn its weights, and show how well it agrees with the truth.
+"""Learn the weights of the confidence of a pose, and measure how well the confidence agrees with the truth.
 
     python benchmarks/confidence.py PHOTOS [PHOTOS ...] -o /tmp/scenes
 
-Every strategy localizes every query of every scene, with all of its keypoints and with a random few, and so
-do queries of another scene, whose poses are all wrong. Each round of each strategy gives one example. Weights
-shown last are learned from all scenes; the reliability is that of weights learned from all scenes but the
-one that is shown, every scene in turn.
+Every strategy localizes every query of every scene, with all keypoints and with random subsets of them, and
+also queries of another scene, whose poses are all wrong. Each round of each strategy gives one example. The
+final weights are learned from all scenes. The reliability of a scene uses weights learned from all other
+scenes.
 """
 
 import argparse
@@ -15,10 +15,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from benchmark_scenes import Scene, scenes
-from deceptive_scenes import deceptions
 from scipy.optimize import minimize
 
+from benchmark_scenes import Scene, scenes
+from deceptive_scenes import deceptions
 from slimsfm.evaluation.protocol import PreparedQuery
 from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
@@ -27,8 +27,8 @@ from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.direct import direct_map
 from slimsfm.synthetic.objects import OBJECTS
 
-KEPT = (1.0, 0.25, 0.08)  # shares of a query's keypoints
-SLIM = 400  # points of a slim map, drawn at random
+KEPT = (1.0, 0.25, 0.08)  # shares of the keypoints of a query
+SLIM = 400  # points of a reduced map, drawn at random
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def examples_of(scene: Scene, other: Scene) -> Iterator[Example]:
-    """The poses that all strategies find in all rounds."""
+    """The poses of all rounds of all strategies."""
     full = scene.references
     described = describe_points(full)
     drawn = np.sort(np.random.default_rng(0).permutation(len(described.points))[:SLIM])
@@ -91,7 +91,7 @@ def examples_of(scene: Scene, other: Scene) -> Iterator[Example]:
 
 
 def thinned(prepared: PreparedQuery, share: float) -> PreparedQuery:
-    """The query with a random part of its keypoints."""
+    """The query with a random subset of its keypoints."""
     count = len(prepared.features)
     kept = np.sort(np.random.default_rng(count).permutation(count)[: max(1, round(share * count))])
     return replace(prepared, features=prepared.features[kept])
@@ -115,7 +115,7 @@ def poses(
 
 
 def learn(examples: Sequence[Example]) -> np.ndarray:
-    """Logistic regression; scenes count alike, and no weight but the constant's is negative."""
+    """Logistic regression with equal weights for all scenes; only the constant may be negative."""
     terms = np.array([one.terms for one in examples])
     signs = np.array([1.0 if one.right else -1.0 for one in examples])
     names = [one.scene for one in examples]

@@ -1,8 +1,8 @@
-"""The scenes that deceive, for benchmarks to share: rendered and mapped once, kept in the output folder.
+"""Deceptive scenes that benchmarks share: rendered and mapped once, stored in the output folder.
 
     python benchmarks/deceptive_scenes.py -o /tmp/deceptions
 
-shows how the exhaustive strategy fares in each.
+Prints the scores of the exhaustive strategy for each scene.
 """
 
 import argparse
@@ -14,20 +14,20 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
-from benchmark_scenes import Scene
 from PIL import Image as PilImage
 
+from benchmark_scenes import Scene
+from deception import DECEPTIONS
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
-from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import evaluate, prepare, queries_of
+from slimsfm.datasets.base import map_object
+from slimsfm.evaluation.protocol import evaluate, prepare_queries, queries_of
 from slimsfm.evaluation.scores import score
 from slimsfm.execution import processes
 from slimsfm.files import replacing
 from slimsfm.mapping import read_map, write_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
-from slimsfm.synthetic.deception import DECEPTIONS
 from slimsfm.synthetic.scene import Take, object_box
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 0
@@ -37,13 +37,13 @@ Job = TypeVar("Job")
 
 
 def deceptions(output: Path, *, workers: int = 1) -> Iterator[Scene]:
-    """Every deception, mapped from its known poses, with its queries."""
+    """Every deception, mapped with its known poses, with its queries."""
     for name in DECEPTIONS:
         yield deception(name, output, workers=workers)
 
 
 def deception(name: str, output: Path, *, workers: int = 1) -> Scene:
-    """One deception; what is in the output folder already is not made again."""
+    """One deception; existing files in the output folder are reused."""
     folder, path = output / "deceptions" / name, output / f"{name}-map"
     if not folder.exists():
         with replacing(folder, overwrite=False) as partial:
@@ -53,7 +53,7 @@ def deception(name: str, output: Path, *, workers: int = 1) -> Scene:
         with quiet(), tempfile.TemporaryDirectory() as workspace:
             write_map(map_object(made, Path(workspace), progress=shown), path)
     references = read_map(path)
-    queries = prepare(references, queries_of(made.query))
+    queries = prepare_queries(references, queries_of(made.query))
     return Scene(name=name, references=references, bytes=bytes_by_part(path)["total"], queries=queries)
 
 
@@ -79,7 +79,7 @@ def run_all(function: Callable[[Job], None], jobs: Sequence[Job], label: str, wo
 
 @lru_cache(maxsize=1)
 def take(name: str, kind: str) -> Take:
-    """One take of a deception; the last one is remembered."""
+    """One take of a deception; the last one is cached."""
     return getattr(DECEPTIONS[name], kind)(FRAMES, WIDTH, HEIGHT, SEED)
 
 

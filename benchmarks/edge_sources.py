@@ -1,21 +1,21 @@
-"""Sources of edges against localizing every image anew from every other: time, decisions, consequences.
+"""Compare sources of edges with localizing every image from every other: time, decisions, consequences.
 
-    python benchmarks/edge_sources.py ../shared/data/plush ../shared/data/fox -o /tmp/edge-sources
+    python benchmarks/edge_sources.py PHOTOS [PHOTOS ...] -o /tmp/edge-sources
 
-Each folder of photos is reconstructed once and every third photo held out (as `slimsfm benchmark images`
-does, whose results in the same output are reused); two rendered objects are added. All sources work in this
-process on one thread, one after the other.
+Each folder of photos is reconstructed once, with every third photo held out. Results of `slimsfm benchmark
+images` in the same output folder are reused. Two rendered objects are added. All sources run in this process
+on one thread, one after the other.
 """
 
 import argparse
 from pathlib import Path
 
 import numpy as np
-from benchmark_scenes import Scene, scenes
 
+from benchmark_scenes import Scene, scenes
 from slimsfm.domination import DominationProblem, exact
-from slimsfm.evaluation.metrics import add_percent
 from slimsfm.evaluation.protocol import evaluate
+from slimsfm.evaluation.scores import add_percent
 from slimsfm.graph import GraphOptions, GraphRun, compute_graph
 from slimsfm.graph.candidates import all_pairs, likely_pairs
 from slimsfm.mapping import Map, keep_images
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def compare(scene: Scene) -> None:
-    """Compute the graph by each source and hold it against the paper's."""
+    """Compute the graph with each source and compare it with the paper's."""
     everything = GraphOptions(edges="localize", candidates="all")
     runs = {"localize": compute_graph(scene.references, everything, progress=shown)}
     for edges in ("matches", "tracks", "hybrid"):
@@ -47,7 +47,7 @@ def compare(scene: Scene) -> None:
 
 
 def describe(scene: Scene, one: GraphRun, paper: GraphRun) -> str:
-    """Time, decisions and what the dominating set is good for."""
+    """Time, decisions and scores of the dominating set."""
     ours, theirs = (run.graph.dense() < THRESHOLD for run in (one, paper))
     off = ~np.eye(len(ours), dtype=bool)
     too_many = (ours & ~theirs & off).sum() / max((ours & off).sum(), 1)
@@ -63,12 +63,12 @@ def describe(scene: Scene, one: GraphRun, paper: GraphRun) -> str:
 
 
 def seconds(one: GraphRun) -> float:
-    """All stages."""
+    """Total over all stages."""
     return sum(one.seconds.values())
 
 
 def pruning(map_: Map, paper: GraphRun) -> str:
-    """What trying only likely pairs costs."""
+    """Effect of trying only likely pairs."""
     likely, everything = likely_pairs(map_), all_pairs(map_)
     edges = paper.graph.dense() < THRESHOLD
     kept = sum(int(edges[u, v]) + int(edges[v, u]) for u, v in likely)

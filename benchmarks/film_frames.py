@@ -1,10 +1,10 @@
-"""The film to track, for benchmarks to share: rendered once, kept in the output folder.
+"""The film for tracking that benchmarks share: rendered once, stored in the output folder.
 
     python benchmarks/film_frames.py -o /tmp/film
 
-writes OUTPUT/color_full/0.png ..., OUTPUT/poses_ba/0.txt ... and intrinsics.txt as OnePose has them, and
-OUTPUT/film.npz: visible (share of the object that nothing hides, one a frame), cut (first frame after it) and
-occlusion (first frame wholly hidden, and the first not hidden any more).
+Writes OUTPUT/color_full/0.png ..., OUTPUT/poses_ba/0.txt ... and intrinsics.txt as in OnePose, and
+OUTPUT/film.npz: visible (unoccluded share of the object per frame), cut (first frame after it) and occlusion
+(first frame with the object completely hidden, and first frame with the object visible again).
 """
 
 import argparse
@@ -13,37 +13,37 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from deceptive_scenes import run_all
 from jaxtyping import Float64
 from PIL import Image as PilImage
 
+from deceptive_scenes import run_all
+from film import Film, film
 from slimsfm.datasets import onepose
 from slimsfm.datasets.base import PosedSequence
 from slimsfm.files import replacing
-from slimsfm.synthetic.film import Film, film
 
 NAME, FRAMES, WIDTH, HEIGHT, SEED = "printed_box", 600, 640, 480, 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FilmFrames:
-    """The frames of the film as files, and what is known of them."""
+    """The frames of the film as files, with their ground truth."""
 
     sequence: PosedSequence
     """Image files, camera and true poses, in the frame of the object."""
 
     visible: Float64[np.ndarray, " frames"]
-    """Share of the object that nothing hides."""
+    """Unoccluded share of the object."""
 
     cut: int
     """The first frame after the cut."""
 
     occlusion: range
-    """The frames in which the object is hidden wholly."""
+    """The frames in which the object is completely hidden."""
 
 
 def film_frames(output: Path, *, workers: int = 2) -> FilmFrames:
-    """The film; it is rendered unless the output folder is there already."""
+    """The film; rendered unless the output folder exists."""
     if not output.exists():
         with replacing(output, overwrite=False) as partial:
             render_film(partial, workers)
@@ -57,7 +57,7 @@ def film_frames(output: Path, *, workers: int = 2) -> FilmFrames:
 
 
 def render_film(folder: Path, workers: int) -> None:
-    """Render every frame and write what is known of them."""
+    """Render every frame and write the ground truth."""
     made = the_film()
     onepose.write_annotation(folder, made.camera, made.cam_from_object)
     ends = (made.occlusion.start, made.occlusion.stop)
@@ -72,7 +72,7 @@ def render_film(folder: Path, workers: int) -> None:
 
 @lru_cache(maxsize=1)
 def the_film() -> Film:
-    """The film, made once a process."""
+    """The film, made once per process."""
     return film(NAME, FRAMES, WIDTH, HEIGHT, SEED)
 
 
@@ -83,7 +83,7 @@ def write_frame(job: tuple[int, Path]) -> None:
 
 
 def main() -> None:
-    """Render and say what there is."""
+    """Render and print a summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("-o", "--output", required=True, type=Path)
     made = film_frames(parser.parse_args().output)

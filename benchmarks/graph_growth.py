@@ -1,10 +1,9 @@
-"""How the cost of the reference graph grows with the number of images, and the memory that it takes.
+"""Measure how time and memory of the reference graph grow with the number of images.
 
     python benchmarks/graph_growth.py -o /tmp/growth --images 50 100 200 500 1000 2000 5000 10000
 
-For each size a walk through a city is made and written as a map; then a process of its own reads it and
-computes the graph from the stored matches, on one core. Prints the table and the exponent of time against
-covisible pairs.
+For each size, writes a map of a walk through a city. A separate process reads it and computes the graph from
+the stored matches, on one core. Prints the table and the exponent of time over covisible pairs.
 """
 
 import argparse
@@ -17,10 +16,10 @@ from time import perf_counter
 
 import numpy as np
 
+from city import CityOptions, city_map
 from slimsfm.files import remove
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.mapping import read_map, write_map
-from slimsfm.synthetic.city import CityOptions, city_map
 
 
 def main() -> None:
@@ -54,7 +53,7 @@ def row_of(count: int, output: Path) -> dict:
 
 
 def measure(path: Path) -> dict:
-    """Read a map and compute its graph here."""
+    """Read a map and compute its graph in this process."""
     start = perf_counter()
     map_ = read_map(path)
     read = perf_counter() - start
@@ -65,7 +64,7 @@ def measure(path: Path) -> dict:
         "edges": run.graph.num_edges(),
         "read_s": round(read, 2),
         **{f"{stage}_s": round(seconds, 2) for stage, seconds in run.seconds.items()},
-        "ms_a_pair": round(1e3 * run.seconds["localize"] / max(run.pairs_tried, 1), 3),
+        "ms_per_pair": round(1e3 * run.seconds["localize"] / max(run.pairs_tried, 1), 3),
         "peak_GiB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 3),
     }
 

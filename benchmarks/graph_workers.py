@@ -1,8 +1,8 @@
-"""One Dask worker against two, for localizing every image of a map from every other one.
+"""Compare one Dask worker with two, for localizing every image of a map from every other.
 
     python benchmarks/graph_workers.py MAP
 
-Each cluster is started, works and is closed within its time; the two graphs must be equal bit by bit.
+The time includes starting and closing the cluster; the two graphs must be equal bit by bit.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def with_workers(path: Path, workers: int) -> GraphRun:
-    """Compute the graph on a cluster of this machine."""
+    """Compute the graph on a local cluster."""
     work = GraphWork(map_path=path, open_executor=partial(dask_cluster, None, workers))
     return compute_graph(read_map(path), GraphOptions(edges="localize", candidates="all"), work)
 

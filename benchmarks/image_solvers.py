@@ -1,12 +1,12 @@
-"""How small the sets are that each solver chooses, how fast, and how far from the proven bound.
+"""Measure the size of the sets that each solver chooses, its time, and the gap to the proven bound.
 
     python benchmarks/image_solvers.py
     python benchmarks/image_solvers.py --maps MAP ... graph.npz ... --skip-large
 
 On 80 graphs of views on a sphere, orbits of 200 to 1000 images, two graphs of 10 000 images and any saved
-reference graphs: `networkx.dominating_set`, the paper's procedure, and the solvers. Each line ends with what
-was proven; the targets follow, met or missed. A map is a folder with `graph*.npz` in it. The solver `cpsat`
-needs OR-Tools. Times are of this machine, other work on it included.
+reference graphs: `networkx.dominating_set`, the paper's procedure, and the solvers. Each line ends with the
+proven bound; then the targets follow, met or missed. A map is a folder with `graph*.npz` in it. The solver
+`cpsat` needs OR-Tools. Times include the effect of other load on this machine.
 """
 
 import argparse
@@ -26,7 +26,7 @@ PAPER = "random"
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What all methods found on one graph."""
+    """Results of all methods on one graph."""
 
     name: str
     problem: DominationProblem
@@ -39,7 +39,7 @@ class Row:
         return max(solution.lower_bound for solution in self.solutions.values())
 
     def above_bound(self, solver: str) -> float:
-        """By how much a solver's set exceeds the best bound, in percent."""
+        """Percentage by which a solver's set exceeds the best bound."""
         return 100 * (self.solutions[solver].cost / self.bound - 1)
 
     def line(self) -> str:
@@ -56,8 +56,10 @@ def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--maps", nargs="*", type=Path, default=[], help="maps or graph files")
-    parser.add_argument("--threshold", type=float, default=0.05, help="of the saved graphs' errors")
-    parser.add_argument("--skip-large", action="store_true", help="leave out the graphs of 10 000 images")
+    parser.add_argument(
+        "--threshold", type=float, default=0.05, help="threshold on the errors of saved graphs"
+    )
+    parser.add_argument("--skip-large", action="store_true", help="skip the graphs of 10 000 images")
     arguments = parser.parse_args()
     small = [name for name in SOLVERS if name != "cpsat"]
     views = [row_of(f"views {i}", sphere(50 + 50 * i // 79, seed=i), small) for i in range(80)]
@@ -75,7 +77,7 @@ def main() -> None:
 def row_of(
     name: str, adjacency: np.ndarray | csr_array, solvers: list[str], limits: dict[str, float] | None = None
 ) -> Row:
-    """Run networkx and some solvers on a graph, and check what they return."""
+    """Run networkx and some solvers on a graph, and check their results."""
     problem = DominationProblem(adjacency)
     graph = nx.from_scipy_sparse_array(problem.adjacency, create_using=nx.DiGraph)
     theirs = nx.dominating_set(graph, start_with=0)
@@ -91,14 +93,14 @@ def row_of(
 def shown(
     name: str, adjacency: np.ndarray | csr_array, solvers: list[str], limits: dict[str, float] | None = None
 ) -> Row:
-    """A row, printed as soon as it is there."""
+    """Make a row and print it immediately."""
     row = row_of(name, adjacency, solvers, limits)
     print(row.line(), flush=True)
     return row
 
 
 def print_views(rows: list[Row]) -> None:
-    """The means over the graphs of views."""
+    """Print the means over the graphs of views."""
     nodes = np.mean([row.problem.num_nodes for row in rows])
     edges = np.mean([row.problem.adjacency.nnz / row.problem.num_nodes - 1 for row in rows])
     print(f"{len(rows)} graphs of views on a sphere: {nodes:.0f} nodes, {edges:.1f} edges a node on average")
@@ -112,7 +114,7 @@ def print_views(rows: list[Row]) -> None:
 
 
 def print_targets(views: list[Row], others: list[Row], large: list[Row]) -> None:
-    """Each target beside what was measured."""
+    """Print each target with the measured value."""
     proofs = [row.solutions["exact"] for row in [*views, *others] if row.problem.num_nodes <= 200]
     unproven = sum(not proof.is_optimal for proof in proofs)
     slowest = max(proof.seconds for proof in proofs)
@@ -135,7 +137,7 @@ def print_targets(views: list[Row], others: list[Row], large: list[Row]) -> None
 
 
 def print_target(text: str, met: bool) -> None:
-    """One line."""
+    """Print one target."""
     print(f"{'met   ' if met else 'MISSED'}  {text}")
 
 
@@ -148,7 +150,7 @@ def sphere(num_views: int, *, seed: int) -> np.ndarray:
 
 
 def orbit(num_views: int, *, seed: int = 0) -> np.ndarray:
-    """A video around an object, rising and falling, a round in 200 frames; within 20 degrees localizes."""
+    """A video around an object, up and down, 200 frames per turn; an image localizes within 20 degrees."""
     rng = np.random.default_rng(seed)
     time = np.arange(num_views) / num_views
     yaw = 2 * np.pi * max(1, num_views // 200) * time
@@ -165,7 +167,7 @@ def angles_deg(directions: np.ndarray) -> np.ndarray:
 
 
 def city_walk(num_views: int, *, seed: int = 0) -> csr_array:
-    """A long video: a camera walks the streets of a grid, looking ahead, and passes many of them again."""
+    """A long video: a camera walks the streets of a grid, looks ahead, and passes many of them again."""
     rng = np.random.default_rng(seed)
     ways = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
     corner, way = np.array([10, 10]), 0
@@ -183,7 +185,7 @@ def city_walk(num_views: int, *, seed: int = 0) -> csr_array:
 
 
 def scattered(num_views: int, *, seed: int = 0) -> csr_array:
-    """Views scattered over a square, each localizing some twenty around it: without the order of a walk."""
+    """Views scattered over a square, in no order; each localizes about twenty around it."""
     rng = np.random.default_rng(seed)
     reach = np.sqrt(20 / num_views / np.pi)
     return near(rng.random((num_views, 2)), np.zeros(num_views), reach=reach, rng=rng)
@@ -192,7 +194,7 @@ def scattered(num_views: int, *, seed: int = 0) -> csr_array:
 def near(
     places: np.ndarray, headings_deg: np.ndarray, *, reach: float, rng: np.random.Generator
 ) -> csr_array:
-    """Views localize those nearby that look the same way: the further, the less they may be turned."""
+    """Views localize nearby views with a similar direction; the allowed angle shrinks with distance."""
     pairs = cKDTree(places).query_pairs(1.5 * reach, output_type="ndarray")
     u, v = np.concatenate([pairs, pairs[:, ::-1]]).T
     turn_deg = np.abs((headings_deg[u] - headings_deg[v] + 180) % 360 - 180)
@@ -202,7 +204,7 @@ def near(
 
 
 def saved_graphs(paths: list[Path], threshold: float) -> list[tuple[str, csr_array]]:
-    """The graphs that `slimsfm graph` wrote, in files or in maps; or square matrices named `errors`."""
+    """Graphs from `slimsfm graph`, in files or in maps, or square matrices named `errors`."""
     files = [
         file for path in paths for file in (sorted(path.glob("graph*.npz")) if path.is_dir() else [path])
     ]
@@ -217,7 +219,7 @@ def saved_graphs(paths: list[Path], threshold: float) -> list[tuple[str, csr_arr
 
 
 def sparse(stored: np.lib.npyio.NpzFile, threshold: float) -> csr_array:
-    """The edges of errors in CSR form."""
+    """The edges of a matrix of errors in CSR format."""
     count = len(stored["names"])
     good = stored["data"] < threshold
     rows = np.repeat(np.arange(count), np.diff(stored["indptr"]))

@@ -1,11 +1,11 @@
-"""Poses against imported COLMAP models, compared with those against the map built of the same photos.
+"""Compare poses against imported COLMAP models with poses against the map built from the same photos.
 
-    python benchmarks/import_equals_build.py ../shared/data/plush
+    python benchmarks/import_equals_build.py PHOTOS
 
-Two thirds of the photos are references, the rest queries. The built model is written as COLMAP would have
-left it elsewhere (old three-file binary, text, new with rigs and frames) beside a database, imported, reduced
-to the same images as the built map, and localized against. A model of pycolmap's own pipeline, with its own
-SIFT, is compared as well, after alignment of the two worlds.
+Two thirds of the photos are references, the rest queries. The built model is written in each of COLMAP's
+formats (old three-file binary, text, new with rigs and frames) with a database, imported, reduced to the same
+images as the built map, and localized against. A model of pycolmap's own pipeline, with its own SIFT, is
+compared as well, after alignment of the two worlds.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def compare(folder: Path, temporary: Path) -> None:
-    """Build once, import in every form, and print median differences of the queries' poses."""
+    """Build once, import in every format, and print median differences of the query poses."""
     names = list_images(folder)
     queries = names[::3]
     references = temporary / "references"
@@ -77,7 +77,7 @@ def localize(map_: Map, folder: Path, cameras: dict) -> Poses:
 
 
 def write_model(built: Map, database: Path, path: Path, form: str) -> Path:
-    """Write the built model in one of COLMAP's forms, its database beside it under the images' own names."""
+    """Write the built model in one of COLMAP's formats, with a database under the images' own names."""
     path.mkdir()
     (built.model.write_text if form == "text" else built.model.write_binary)(path)
     if form == "old binary":
@@ -92,7 +92,7 @@ def write_model(built: Map, database: Path, path: Path, form: str) -> Path:
 
 
 def run_colmap(images: Path, path: Path) -> Path:
-    """Reconstruct with pycolmap alone, its default SIFT and its exhaustive matching."""
+    """Reconstruct with pycolmap alone, with its default SIFT and exhaustive matching."""
     path.mkdir()
     database = path / "database.db"
     options = pycolmap.FeatureExtractionOptions()
@@ -109,7 +109,7 @@ def run_colmap(images: Path, path: Path) -> Path:
 
 
 def print_difference(form: str, expected: Poses, found: Poses, built: Map) -> None:
-    """Print the median relative corner distance of the poses that both localized."""
+    """Print the median relative corner distance of the poses that both have."""
     both = sorted(expected.keys() & found.keys())
     distances = [corner_error(expected[name], found[name], built.box) for name in both]
     print(

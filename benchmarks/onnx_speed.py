@@ -1,10 +1,10 @@
-"""Learned methods on the CPU: PyTorch against onnxruntime, from image or keypoints to features or matches.
+"""Speed of learned methods on the CPU: PyTorch against onnxruntime, per extraction or matching.
 
     python benchmarks/onnx_speed.py -o /tmp/onnx --weights WEIGHTS
 
-Weights that the folder lacks are random, which changes no time but LightGlue's: trained, PyTorch's stops as
-soon as it is sure, while an ONNX file runs through. Both take turns; the least times count, once by the clock
-and once by what the processor worked, which other programs disturb less.
+Missing weights are random, which changes only the time of LightGlue: with trained weights PyTorch stops as
+soon as it is confident, while an ONNX file runs all layers. Both alternate. The smallest times count, once as
+wall time and once as CPU time, which other programs disturb less.
 """
 
 import argparse
@@ -16,8 +16,8 @@ from time import perf_counter, process_time
 import cv2
 import numpy as np
 import torch
-from random_weights import write_random_weights
 
+from random_weights import write_random_weights
 from slimsfm.features import Features, load_extractor, load_matcher, unit_rows
 from slimsfm.features.exporting import export_method
 from slimsfm.networks.devices import DEVICE
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def prepare(output: Path, weights: Path | None) -> tuple[Path, Path]:
-    """Two folders of weights, one of which has ONNX files, too."""
+    """Two folders of weights, one of which also has ONNX files."""
     folders = output / "torch", output / "onnx"
     write_random_weights(folders[0])
     folders[1].mkdir(parents=True, exist_ok=True)
@@ -89,7 +89,7 @@ def picture() -> np.ndarray:
 
 
 def described(count: int, seed: int) -> Features:
-    """Keypoints anywhere, of descriptors of any kind."""
+    """Random keypoints with random descriptors."""
     rng = np.random.default_rng(seed)
     return Features(
         keypoints=rng.uniform((1, 1), np.array(SIZE) - 1, (count, 2)).astype(np.float32),
@@ -100,7 +100,7 @@ def described(count: int, seed: int) -> Features:
 
 
 def compare(title: str, folders: tuple[Path, Path], ways: list[Callable], given: tuple, repeats: int) -> None:
-    """Print how long both ways take."""
+    """Print the times of both runtimes."""
     times = np.zeros((len(folders), repeats + 1, 2))
     for turn in range(repeats + 1):
         for way, folder in enumerate(folders):
@@ -108,7 +108,7 @@ def compare(title: str, folders: tuple[Path, Path], ways: list[Callable], given:
             start = perf_counter(), process_time()
             ways[way](*given)
             times[way, turn] = perf_counter() - start[0], process_time() - start[1]
-    least = 1e3 * times[:, 1:].min(axis=1)  # the first turn loads
+    least = 1e3 * times[:, 1:].min(axis=1)  # the first round loads
     by_clock, of_processor = least[0] / least[1]
     cells = "".join(f"{clock:8.0f}{processor:8.0f}" for clock, processor in least)
     print(f"{title:24}{cells}   {by_clock:.2f} {of_processor:.2f}", flush=True)

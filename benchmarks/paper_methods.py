@@ -1,10 +1,10 @@
-"""The paper's four methods on a rendered object: full map, dominating set, random set; time by stage.
+"""The four methods of the paper on a rendered object: full map, dominating set, random set; time by stage.
 
     python benchmarks/paper_methods.py -o OUT [--weights WEIGHTS] [--object boulder] [--queries 4]
 
-Weights that are not in WEIGHTS are seeded random ones. Untrained networks find no matches to build a map
-from, so the map then is the object's SIFT map, its keypoints described by the method. With random weights
-just times mean something, and no accuracy is printed.
+Weights that are not in WEIGHTS are random with a fixed seed. Untrained networks find no matches to build a
+map from, so the map is then the SIFT map of the object with descriptors of the method at its keypoints. With
+random weights only times are meaningful, and no accuracy is printed.
 """
 
 import argparse
@@ -17,15 +17,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from benchmark_scenes import rendered
 from random_weights import write_random_weights
-
 from slimsfm.cli.output import quiet
-from slimsfm.datasets.base import ObjectSequences
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import ObjectSequences, map_object
 from slimsfm.datasets.onepose import read_object
-from slimsfm.evaluation.outcomes import Outcomes, join, outcomes_of
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, outcomes_of, prepare_queries, queries_of
+from slimsfm.evaluation.results import Outcomes, join_outcomes
 from slimsfm.evaluation.scores import Scores, score
 from slimsfm.features import Features
 from slimsfm.features.image_matching import load_image_matcher
@@ -44,7 +43,7 @@ from slimsfm.weights import FOLDER, WEIGHTS
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """One of the paper's four methods."""
+    """One of the four methods of the paper."""
 
     name: str
     strategy: str
@@ -116,7 +115,7 @@ def main() -> None:
 
 
 def _weights(folder: Path, given: Path | None) -> set[str]:
-    """Fill a folder with random weights and what is given over them; which weights are given."""
+    """Fill a folder with random weights, then with the given ones; return the names of the given ones."""
     write_random_weights(folder)
     found = {name for name, one in WEIGHTS.items() if given and (given / one.file).is_file()}
     for name in found:
@@ -133,7 +132,7 @@ def _built(made: ObjectSequences, method: Method) -> Map:
 
 
 def _described(map_: Map, made: ObjectSequences, extractor: str) -> Map:
-    """The map with its keypoints described by another method."""
+    """The map with descriptors of another method at its keypoints."""
     photos = {path.name: read_image(path) for path in made.mapping.image_paths if path.name in map_.images}
     describe = _by_superpoint() if extractor == "superpoint" else _by_loftr()
     features = {
@@ -167,7 +166,7 @@ def _by_loftr() -> Describe:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """How one method does on one variant of a map."""
+    """Results of one method on one variant of a map."""
 
     references: float
     points: float
@@ -183,7 +182,7 @@ def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count:
         "random": [keep_random_images(map_, len(chosen), seed=seed) for seed in range(3)],
     }
     step = max(1, len(made.query.image_paths) // count)
-    queries, rows = prepare(map_, queries_of(made.query)[::step][:count]), {}
+    queries, rows = prepare_queries(map_, queries_of(made.query)[::step][:count]), {}
     for variant, maps in variants.items():
         stored = [_stored(one, output / "map") for one in maps]
         run = _with_boxes if method.is_box_given else evaluate
@@ -191,13 +190,13 @@ def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count:
         rows[variant] = Row(
             references=float(np.mean([len(one.images) for one in stored])),
             points=float(np.mean([len(one.point3D_ids) for one in stored])),
-            scores=score(join(outcomes), metric=True, trials=len(stored)),
+            scores=score(join_outcomes(outcomes), metric=True, draws=len(stored)),
         )
     return rows
 
 
 def _with_boxes(map_: Map, queries: list[PreparedQuery], strategy: str, _matcher: str) -> Outcomes:
-    """Localize queries near their true poses, after one that is not timed."""
+    """Localize queries near their true poses, after one without timing."""
     localizer = Localizer(map_, LocalizationOptions(strategy=strategy))
     found = [
         localizer.localize_near(read_image(one.path), one.camera, one.cam_from_world)

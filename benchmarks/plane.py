@@ -1,10 +1,10 @@
-"""Size of the map, time a query and accuracy of every strategy on full and reduced maps, in one run.
+"""Map size, time per query and accuracy of every strategy on full and reduced maps, in one run.
 
     python benchmarks/plane.py PHOTOS [PHOTOS ...] -o /tmp/plane
 
-Queries are in no map. Each strategy localizes all of them, one after the other, after one that is not timed;
-retrieval with 1 to 10 images. Shown last: how much faster progressive on the full map and direct on the
-reduced one are than exhaustive on the full map, and what they lose.
+Queries are in no map. Each strategy localizes all of them, one after the other, after one without timing;
+retrieval with 1 to 10 images. Ends with a summary: the speedup of progressive on the full map and of direct
+on the reduced map over exhaustive on the full map, and their loss.
 """
 
 import argparse
@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+
 from benchmark_scenes import Scene, scenes
 from deceptive_scenes import deceptions
-
-from slimsfm.evaluation.metrics import SURE
+from slimsfm.evaluation.scores import SURE
 from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
@@ -33,7 +33,7 @@ RETRIEVED = (1, 2, 3, 5, 10)
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """How queries fare with one map and strategy."""
+    """Scores of one map and strategy."""
 
     scene: str
     map: str
@@ -49,7 +49,7 @@ class Result:
 
     @property
     def ms(self) -> float:
-        """Matching and pose."""
+        """Time of matching and pose estimation, in milliseconds."""
         return self.ms_match + self.ms_pose
 
 
@@ -72,14 +72,14 @@ def main() -> None:
 
 
 def all_scenes(arguments: argparse.Namespace) -> Iterator[Scene]:
-    """What was asked for."""
+    """The requested scenes."""
     yield from scenes(arguments.folders, arguments.objects, arguments.output)
     if arguments.deceptive:
         yield from deceptions(arguments.output)
 
 
 def measure(scene: Scene, folder: Path, *, brief: bool) -> Iterator[Result]:
-    """Every strategy on every map."""
+    """Run every strategy on every map."""
     full, points = scene.references, folder / f"{scene.name}-points"
     if not points.exists():
         found = frontier(full, None, weigh_map, FrontierOptions(uses=("direct",)), shown)
@@ -153,7 +153,7 @@ def line(one: Result) -> str:
 
 
 def sum_up(results: list[Result]) -> None:
-    """Print what the targets speak of."""
+    """Print the figures that have targets."""
     by_key = {(one.scene, one.map, one.strategy): one for one in results}
     aims = (("full", "progressive", 20), ("points", "direct", 60))
     for map_, strategy, aim in aims:

@@ -1,7 +1,7 @@
-"""Write weight files of the published names and layouts, filled with seeded random numbers.
+"""Write weight files with the published names and layouts, filled with seeded random numbers.
 
-They show that methods run, how long they take and what a map's reduction gains; what they compute means
-nothing, so no accuracy can be claimed. ALIKED is left out: its files are known by their checksums.
+They show that methods run, how long they take and what reducing a map saves. Their results are meaningless,
+so they say nothing about accuracy. ALIKED is left out, because its files are checked by checksum.
 
     python benchmarks/random_weights.py -o WEIGHTS
 """
@@ -26,7 +26,7 @@ from slimsfm.networks.onepose_plus import OnePosePlusMatcher
 
 
 def write_random_weights(folder: Path, seed: int = 0) -> Path:
-    """Write a file for every method but ALIKED."""
+    """Write a file for every method except ALIKED."""
     torch.manual_seed(seed)
     superglue = SuperGlueForKeypointMatching(SuperGlueConfig())
     states = {

@@ -20,7 +20,8 @@ from slimsfm.mapping import read_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.report.frames import draw_box
-from slimsfm.synthetic.film import FRAMES_PER_SECOND, Film, film
+from slimsfm.report.query_video import FRAMES_PER_SECOND
+from slimsfm.synthetic.film import Film, film
 from slimsfm.tracking import Tracked, Tracker
 from tracking import slim_map
 

@@ -1,13 +1,13 @@
-"""Captures of one side of an object, asked from their rim: what each choice of images loses there.
+"""Captures of one side of an object with queries from their rim: the loss of each choice of images.
 
     python benchmarks/rim.py -o /tmp/rim
 
 Two objects are each captured twice, densest in the middle: from a hemisphere above them, and from a fan of
-150 degrees before them. 40 queries a capture come from its outermost 12 degrees and slightly beyond, under
-other light and on another table. Each choice of reference images is asked for all of them, with both
-strategies; the share within 0.1, 0.05 and 0.02 of the diagonal follows, and what that is less than with all
-images. Renderings and maps are kept in the output folder, so only the first run makes them. Targets: `exact +
-rim` and what plain `slimsfm reduce` gives lose at most 1 point over all captures.
+150 degrees in front of them. 40 queries per capture come from its outermost 12 degrees and slightly beyond,
+in other light and on another table. Each choice of reference images localizes all of them, with both
+strategies. Prints the share within 0.1, 0.05 and 0.02 of the diagonal, and the loss against all images.
+Renderings and maps are stored in the output folder, so only the first run makes them. Targets: `exact + rim`
+and the default result of `slimsfm reduce` lose at most 1 point over all captures.
 """
 
 import argparse
@@ -26,8 +26,8 @@ from PIL import Image as PilImage
 from slimsfm.cli import run
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
-from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
+from slimsfm.datasets.base import map_object
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries, queries_of
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import ReferenceGraph, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
@@ -54,7 +54,7 @@ TARGETED = ("exact + rim", "default")
 
 @dataclass(frozen=True, kw_only=True)
 class Views:
-    """Directions to cameras, in degrees, an entry a camera."""
+    """Directions to cameras, in degrees, one entry per camera."""
 
     azimuths: np.ndarray
     elevations: np.ndarray
@@ -78,7 +78,7 @@ class Capture:
 
 
 def hemisphere(rng: np.random.Generator, count: int, *, rim: bool) -> Views:
-    """Down to 10 degrees above the horizon, all around."""
+    """Down to 10 degrees above the horizon, from all sides."""
     share = (np.arange(count) + 0.5) / count
     if rim:
         return Views(azimuths=rng.uniform(0, 360, count), elevations=rng.uniform(5, 22, count))
@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def captured(name: str, shape: str, output: Path) -> Capture:
-    """Render and map, unless that was done before."""
+    """Render and map, unless the files exist."""
     folder = output / f"{name}-{shape}"
     if not (folder / "map").exists():
         shutil.rmtree(folder, ignore_errors=True)
@@ -125,7 +125,7 @@ def captured(name: str, shape: str, output: Path) -> Capture:
         with tempfile.TemporaryDirectory() as workspace, quiet():
             write_map(map_object(onepose.read_object(folder / name), Path(workspace)), folder / "map")
     map_ = read_map(folder / "map")
-    queries = prepare(map_, queries_of(onepose.read_object(folder / name).query))
+    queries = prepare_queries(map_, queries_of(onepose.read_object(folder / name).query))
     graph = compute_graph(map_).graph
     return Capture(name=f"{name}, {shape}", path=folder / "map", map=map_, graph=graph, queries=queries)
 
@@ -161,7 +161,7 @@ def takes(name: str, shape: str) -> Iterator[Take]:
 
 
 def measured(capture: Capture) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
-    """Choice, strategy and the relative corner errors of the queries; printed as well."""
+    """Relative corner errors of the queries per choice and strategy; also printed."""
     rows: dict[tuple[str, str], np.ndarray] = {}
     for choice, (map_, strategies) in maps_of(capture):
         for strategy in strategies:
@@ -172,7 +172,7 @@ def measured(capture: Capture) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
 
 
 def maps_of(capture: Capture) -> Iterator[tuple[str, tuple[Map, tuple[str, ...]]]]:
-    """The map of each choice, and the strategies it is for."""
+    """The map of each choice, and its strategies."""
     both = ("exhaustive", "direct")
     yield "full", (capture.map, both)
     for choice, options in CHOICES.items():
@@ -205,7 +205,7 @@ def summarize(rows: dict[tuple[str, str], np.ndarray], *, targets: bool = False)
 
 
 def fmt(values: np.ndarray) -> str:
-    """Shares or losses at each fraction."""
+    """Shares or losses at each fraction, as text."""
     return " / ".join(f"{value:5.1f}" for value in values)
 
 

@@ -1,9 +1,9 @@
-"""Every way to choose what to keep, on photos and rendered objects: accuracy, size, time, what was foretold.
+"""Every way to choose what to keep, on photos and rendered objects: accuracy, size, time, forecasts.
 
     python benchmarks/selection.py PHOTOS [PHOTOS ...] -o /tmp/selection
 
-Each folder of photos is reconstructed once and every third photo held out; six objects are rendered. All ways
-localize the same queries, which no map knows, in this process, one after the other.
+Each folder of photos is reconstructed once, with every third photo held out; six objects are rendered. All
+choices localize the same queries, which are in no map, in this process, one after the other.
 """
 
 import argparse
@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmark_scenes import Scene, scenes
 
+from benchmark_scenes import Scene, scenes
 from slimsfm.evaluation.protocol import evaluate
 from slimsfm.evaluation.scores import score
 from slimsfm.graph import GraphOptions, compute_graph
@@ -52,7 +52,7 @@ IMAGE_SETS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """How queries fare with one map and strategy."""
+    """Scores of one map and strategy."""
 
     scene: str
     method: str
@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def measure(scene: Scene, slim: Path, *, brief: bool) -> Iterator[Result]:
-    """The full map both ways, what plain reduce gives, points by every selector, image sets both ways."""
+    """Measure the full map, the default of reduce, points by every selector, and image sets."""
     full = scene.references
     for strategy in ("exhaustive", "direct"):
         yield tried(scene, full, scene.bytes, "full", strategy)
@@ -114,7 +114,7 @@ def selected(scene: Scene, slim: Path) -> Iterator[Result]:
 
 
 def image_sets(scene: Scene, slim: Path) -> Iterator[Result]:
-    """Dominating sets of images, matched with and directly."""
+    """Dominating sets of images, matched by image and directly."""
     full = scene.references
     graph = compute_graph(full, GraphOptions(edges="localize", candidates="all")).graph
     trials = Trials(full, LeftOut(full))
@@ -172,7 +172,7 @@ def line(one: Result) -> str:
 
 
 def sum_up(results: list[Result]) -> None:
-    """Print what the targets speak of."""
+    """Print the figures that have targets."""
     names = list(dict.fromkeys(one.scene for one in results))
     full = {one.scene: one for one in results if (one.method, one.strategy) == ("full", "exhaustive")}
     default = {one.scene: one for one in results if one.method == "default"}
@@ -196,7 +196,7 @@ def sum_up(results: list[Result]) -> None:
 
 
 def share_of_points(results: list[Result], names: list[str]) -> None:
-    """How many points `information` needs for what K-cover reaches with each of its budgets."""
+    """Number of points that `information` needs to match K-cover, for each of its budgets."""
     by_median, by_share = [], []
     for name in names:
         ours, theirs = (curve(results, name, method) for method in ("information", "kcover"))
@@ -214,7 +214,7 @@ def share_of_points(results: list[Result], names: list[str]) -> None:
 
 
 def needed(curve: list[Result], goodness: np.ndarray, wanted: float) -> float:
-    """Points at which a rising curve reaches what is wanted, interpolated; infinite if it does not."""
+    """Number of points at which a rising curve reaches a value, interpolated; infinite if it does not."""
     first = int(np.searchsorted(goodness, wanted))
     if first == len(curve):
         return np.inf

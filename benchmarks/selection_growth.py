@@ -1,10 +1,10 @@
-"""How the cost of choosing points grows with the map, and the memory that it takes.
+"""Measure how time and memory of choosing points grow with the map.
 
     python benchmarks/selection_growth.py --points 10000 100000 1000000
 
-For each size a walk down a street is made: an image sees the points near where it was taken, a point is seen
-by about ten images, there are a hundred points an image. Then a process of its own chooses points by each
-selector; its peak memory includes the problem. Prints the table, and the largest size against the targets.
+For each size, makes a walk down a street: an image sees the points near its position, about ten images see
+each point, and there are a hundred points per image. A separate process chooses points with each selector;
+its peak memory includes the problem. Prints the table, and compares the largest size with the targets.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def row_of(points: int, selector: str, kept: float) -> dict:
 
 
 def measure(points: int, selector: str, kept: float) -> dict:
-    """Make a street and choose its points here."""
+    """Make a street and choose its points in this process."""
     problem = street(points, max(points // POINTS_AN_IMAGE, 1))
     count = round(kept * problem.num_images)
     start = perf_counter()
@@ -98,7 +98,7 @@ def _covisibility(rng: np.random.Generator, num_points: int, num_images: int) ->
 
 
 def _twists(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Of points in the view of a camera, near ones and far ones."""
+    """Twists of points in the view of a camera, near and far."""
     z = rng.uniform(3, 30, count)
     x, y = z * rng.uniform(-0.6, 0.6, (2, count))
     zero = np.zeros(count)
@@ -114,7 +114,7 @@ def _corner_twists(rng: np.random.Generator, num_images: int) -> np.ndarray:
 
 
 def _motions(in_cam: np.ndarray) -> np.ndarray:
-    """How points move in the camera's frame when it turns (radians) and shifts (diagonals)."""
+    """Motion of points in the camera frame when it turns (radians) and shifts (diagonals)."""
     x, y, z = in_cam.T
     zero = np.zeros(len(in_cam))
     turned = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)

@@ -1,10 +1,10 @@
-"""From image file to pose: queries a second on all cores, and what detector settings buy.
+"""From image file to pose: queries per second on all cores, and the effect of detector settings.
 
     python benchmarks/throughput.py -o /tmp/plane
 
-Takes the rendered objects and the reduced maps that `plane.py` left in the output folder. Each setting
-localizes the same files on as many threads as there are cores; decoding, extraction, matching, pose and
-verification count. Keypoints are cut to the strongest, images shrunk before extraction.
+Uses the rendered objects and the reduced maps of `plane.py` in the output folder. Each setting localizes the
+same files on one thread per core; the time includes decoding, extraction, matching, pose estimation and
+verification. Only the strongest keypoints are kept, and images are shrunk before extraction.
 """
 
 import argparse
@@ -16,8 +16,8 @@ from time import perf_counter
 import numpy as np
 
 from slimsfm.datasets.onepose import read_object
-from slimsfm.evaluation.protocol import Query, queries_of
 from slimsfm.execution import map_on_threads, num_cores
+from slimsfm.evaluation.protocol import PosedQuery, queries_of
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer
 from slimsfm.mapping import read_map
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def measure(output: Path, name: str, features: int, size: int) -> tuple[float, list[float]]:
-    """Queries a second, and the error of each."""
+    """Queries per second, and the error of each query."""
     map_ = read_map(output / "reduced" / f"{name}-points")
     options = {**map_.info.extractor_options, "max_features": features, "max_image_size": size}
     localizer = Localizer(replace(map_, info=replace(map_.info, extractor_options=options)))
@@ -61,7 +61,7 @@ def measure(output: Path, name: str, features: int, size: int) -> tuple[float, l
     return rate, errors
 
 
-def localize(localizer: Localizer, query: Query) -> Localization:
+def localize(localizer: Localizer, query: PosedQuery) -> Localization:
     """From file to pose."""
     return localizer.localize(read_image(query.path), query.camera)
 

@@ -1,11 +1,11 @@
-"""How fast, how exactly and how safely an object is tracked, against localizing each frame on its own.
+"""Speed, accuracy and reliability of tracking an object, against localizing each frame on its own.
 
     python benchmarks/tracking.py -o /tmp/scenes
 
-The film of `film_frames.py` is encoded as a video and tracked on the full map and on a slim one, from
+The film of `film_frames.py` is encoded as a video and tracked on the full map and on a reduced one, from
 decoding to pose. The same decoded frames are localized one by one, on the full map, against every reference
-image. What is made is kept in the output folder: the film, its map, the slim map and, with --draw, the video
-with the object's box drawn in. A target stands beside each figure that has one.
+image. The output folder stores the film, its map, the reduced map and, with --draw, the video with the box of
+the object. Figures with a target show it.
 """
 
 import argparse
@@ -16,10 +16,11 @@ from time import perf_counter, process_time
 
 import numpy as np
 import pycolmap
-from benchmark_scenes import rendered
-from film_frames import NAME, FilmFrames, film_frames
 from jaxtyping import Float64
 
+from benchmark_scenes import rendered
+from film import FRAMES_PER_SECOND
+from film_frames import NAME, FilmFrames, film_frames
 from slimsfm.arrays import Image
 from slimsfm.cli import run
 from slimsfm.geometry import Box, corner_error
@@ -29,7 +30,6 @@ from slimsfm.photos import read_image
 from slimsfm.pose import PoseEstimate
 from slimsfm.progress import shown
 from slimsfm.report.frames import ESTIMATED_RGB, draw_box
-from slimsfm.synthetic.film import FRAMES_PER_SECOND
 from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 from slimsfm.tracking.video import open_frames, write_video
 
@@ -39,21 +39,21 @@ WANTED_FPS, WANTED_BACK = 30.0, 10
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """What became of each frame."""
+    """Outcome of each frame."""
 
     results: list[Tracked]
     errors: Float64[np.ndarray, " frames"]
-    """Relative corner errors; infinite where there is no pose."""
+    """Relative corner errors; infinite without a pose."""
 
     seconds: Float64[np.ndarray, " frames"]
-    """From asking the decoder for a frame to its pose."""
+    """Time from requesting a frame from the decoder to its pose."""
 
     cpu_seconds: float
-    """Of all threads."""
+    """CPU time of all threads."""
 
 
 def main() -> None:
-    """Make what is not there, track and print."""
+    """Prepare missing files, track and print."""
     arguments = parsed()
     film = film_frames(arguments.film or arguments.output / "film")
     video = encoded(film, arguments.output / "film.mp4")
@@ -97,7 +97,7 @@ def encoded(film: FilmFrames, path: Path) -> Path:
 
 
 def slim_map(full: Path, output: Path) -> Path:
-    """The full map, reduced as `slimsfm reduce` does by itself."""
+    """The full map, reduced with the defaults of `slimsfm reduce`."""
     path = output / f"{NAME}-slim"
     if not path.exists() and run(["reduce", str(full), "-o", str(path)]):
         raise SystemExit(1)
@@ -115,7 +115,7 @@ def truth_of(film: FilmFrames) -> list[pycolmap.Rigid3d]:
 
 
 def error_of(pose: PoseEstimate | None, true_cam_from_world: pycolmap.Rigid3d, box: Box) -> float:
-    """Relative corner error; infinite where there is no pose."""
+    """Relative corner error; infinite without a pose."""
     return np.inf if pose is None else corner_error(pose.cam_from_world, true_cam_from_world, box)
 
 
@@ -132,7 +132,7 @@ def each_alone(film: FilmFrames, video: Path, full: Map) -> Float64[np.ndarray, 
 
 
 def tracked(film: FilmFrames, video: Path, map_: Map, options: TrackerOptions) -> Run:
-    """Track the video; nothing is warm at its first frame but what the localizer has made."""
+    """Track the video; at the first frame, only the localizer is initialized."""
     tracker = Tracker(Localizer(map_), options)
     results, seconds, cpu = [], [], process_time()
     last = perf_counter()
@@ -151,7 +151,7 @@ def tracked(film: FilmFrames, video: Path, map_: Map, options: TrackerOptions) -
 
 
 def accuracy(errors: Float64[np.ndarray, " frames"], film: FilmFrames) -> str:
-    """Shares of right poses among the frames with anything of the object in sight, and poses of nothing."""
+    """Shares of correct poses with the object in view, and the number of poses without it."""
     seen = film.visible > 0
     shares = ", ".join(f"ADD-{limit}d {add(errors, film, limit):.2f} %" for limit in (0.1, 0.05, 0.02))
     median = np.median(errors[seen & np.isfinite(errors)])
@@ -164,12 +164,12 @@ def accuracy(errors: Float64[np.ndarray, " frames"], film: FilmFrames) -> str:
 def add(
     errors: Float64[np.ndarray, " frames"], film: FilmFrames, limit: float, in_sight: float = 0.0
 ) -> float:
-    """Percent of the frames with more than this share of the object in sight whose error is below a limit."""
+    """Percentage of frames with an error below a limit, if more than this share of the object is in view."""
     return 100 * float(np.mean(errors[film.visible > in_sight] < limit))
 
 
 def back(errors: Float64[np.ndarray, " frames"], since: int) -> float:
-    """Frames from one on until the first right pose; 0 where that one has it."""
+    """Number of frames until the first correct pose; 0 if the first frame has one."""
     right = np.flatnonzero(errors[since:] < RIGHT)
     return float(right[0]) if len(right) else np.inf
 
@@ -197,7 +197,7 @@ def show(name: str, ran: Run, film: FilmFrames, alone: Float64[np.ndarray, " fra
 
 
 def list_frames(ran: Run, film: FilmFrames) -> None:
-    """Frames that were not tracked, or not well."""
+    """Print the frames that were not tracked, or badly."""
     for index, (one, error) in enumerate(zip(ran.results, ran.errors, strict=True)):
         if one.state != "tracked" or error > 0.02 or film.visible[index] < 0.8:
             confidence = one.pose.confidence if one.pose else None
@@ -208,7 +208,7 @@ def list_frames(ran: Run, film: FilmFrames) -> None:
 
 
 def draw(video: Path, ran: Run, film: FilmFrames, box: Box, path: Path) -> None:
-    """Write the video with the box that was found."""
+    """Write the video with the estimated box."""
     with write_video(path, FRAMES_PER_SECOND, overwrite=True) as write:
         for image, one in zip(images_of(video), ran.results, strict=True):
             drawn = image.copy()

@@ -1,4 +1,4 @@
-"""A small rendered object and its map from known poses, made once a session."""
+"""A small rendered object and its map from known poses, made once per session."""
 
 import tempfile
 from dataclasses import dataclass
@@ -7,14 +7,13 @@ from pathlib import Path
 
 from commands import Outcome, slimsfm
 from slimsfm.cli.output import quiet
-from slimsfm.datasets.base import PosedSequence
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import PosedSequence, map_object
 from slimsfm.datasets.onepose import read_object
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
 
 NAME = "boulder"
-MAPPING_FRAMES = 30  # with fewer, views are too far apart for Structure from Motion
+MAPPING_FRAMES = 30  # with fewer, the views are too far apart for SfM
 QUERY_FRAMES = 4
 
 

@@ -1,8 +1,8 @@
-"""A data set of small objects whose maps are there already; other processes import it by name.
+"""A data set of small objects with existing maps; other processes import it by name.
 
 ROOT/OBJECT/map/          a map of a few images, from which the queries are held out
 ROOT/OBJECT/object.json   the folder of the images, and which of them are queries
-ROOT/OBJECT/broken        what goes wrong when the object is read, if something does
+ROOT/OBJECT/broken        name of the failure when the object is read; optional
 """
 
 import json
@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from slimsfm.datasets.base import Making, ObjectSequences, PosedSequence
+from slimsfm.datasets.base import LoadOptions, ObjectSequences, PosedSequence
 from slimsfm.errors import InputError
-from slimsfm.evaluation.benchmark import Bench, BenchmarkOptions
+from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup
 from slimsfm.evaluation.run import run_benchmark
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
@@ -40,17 +40,17 @@ class TinyDataset:
             raise InputError(f"{self.path} holds no object")
         return tuple(found)
 
-    def load(self, name: str, making: Making) -> ObjectSequences:  # noqa: ARG002
+    def load(self, name: str, options: LoadOptions) -> ObjectSequences:  # noqa: ARG002
         broken = self.path / name / "broken"
         if broken.exists():
             raise FAILURES[broken.read_text()]
         truth = read_map(self.path / name / "map")
-        told = json.loads((self.path / name / "object.json").read_text())
-        mapping = [image for image in truth.images if image not in told["queries"]]
+        known = json.loads((self.path / name / "object.json").read_text())
+        mapping = [image for image in truth.images if image not in known["queries"]]
         return ObjectSequences(
             name=name,
-            mapping=_sequence(truth, Path(told["photos"]), mapping),
-            query=_sequence(truth, Path(told["photos"]), told["queries"]),
+            mapping=_sequence(truth, Path(known["photos"]), mapping),
+            query=_sequence(truth, Path(known["photos"]), known["queries"]),
             box=truth.box,
             truth=truth,
         )
@@ -72,7 +72,7 @@ def add_object(root: Path, name: str, map: Map, photos: Path, queries: list[str]
 
 
 def doing_at(stage: str, time: int, do: Callable[[], object]) -> ProgressBar:
-    """A progress bar that does something when a stage begins for the so-many-th time."""
+    """A progress bar that calls `do` when a stage begins for the n-th time."""
     begun = []
 
     def progress(items, label):
@@ -91,4 +91,6 @@ def die() -> None:
 if __name__ == "__main__":
     root, run, stage, time = sys.argv[1:]
     progress = doing_at(stage, int(time), die)
-    run_benchmark(TinyDataset(path=Path(root)), Bench(folder=Path(run), options=OPTIONS, progress=progress))
+    run_benchmark(
+        TinyDataset(path=Path(root)), BenchmarkSetup(folder=Path(run), options=OPTIONS, progress=progress)
+    )

@@ -66,7 +66,7 @@ def test_the_same_command_again_measures_nothing_again(synthetic, boulder):
     assert contents(folder) == before
     other = slimsfm(*arguments, "-o", folder, "--strategies", "exhaustive")
     assert other.code == 2
-    assert f"{folder}: holds a run of other options" in other.err
+    assert f"{folder}: holds a run with other options" in other.err
     assert contents(folder) == before
 
 
@@ -76,7 +76,7 @@ def test_a_published_layout_gives_the_figures_that_the_synthetic_one_gives(synth
     assert done.code == 0, done.err
     ours, theirs = read_run(synthetic[0]), read_run(tmp_path / "run")
     assert digest_of(theirs.objects) == digest_of(ours.objects)
-    for a, b in zip(ours.objects[0].cells, theirs.objects[0].cells, strict=True):
+    for a, b in zip(ours.objects[0].measurements, theirs.objects[0].measurements, strict=True):
         assert np.array_equal(a.outcomes.error, b.outcomes.error)
 
 
@@ -125,7 +125,7 @@ def test_one_broken_object_holds_up_no_other(boulder, tmp_path):
     done = slimsfm(*arguments)
     assert done.code == 2
     assert str(pose) in done.err
-    assert "1 of 2 objects could not be measured" in done.err
+    assert "1 of 2 objects failed" in done.err
     run = read_run(tmp_path / "run")
     assert [one.name for one in run.objects] == [NAME]
     assert list(run.failed) == ["broken"]

@@ -12,8 +12,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from slimsfm.datasets.base import Making, ObjectSequences, PosedSequence
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import LoadOptions, ObjectSequences, PosedSequence, map_object
 from slimsfm.datasets.onepose import write_box
 from slimsfm.datasets.synthetic import Synthetic
 from slimsfm.geometry import Box, corner_error, project
@@ -63,8 +62,8 @@ def known() -> Known:
 
 
 @pytest.fixture
-def making(tmp_path) -> Making:
-    return Making(folder=tmp_path / "made")
+def making(tmp_path) -> LoadOptions:
+    return LoadOptions(folder=tmp_path / "made")
 
 
 @pytest.fixture(scope="session")
@@ -146,7 +145,7 @@ def rendered(tmp_path_factory) -> tuple[Synthetic, ObjectSequences]:
     dataset = Synthetic(
         path=folder, objects=("printed_box",), mapping_frames=16, query_frames=2, width=320, height=240
     )
-    return dataset, dataset.load("printed_box", Making(folder=folder))
+    return dataset, dataset.load("printed_box", LoadOptions(folder=folder))
 
 
 @pytest.fixture(scope="session")

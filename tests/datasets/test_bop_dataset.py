@@ -60,7 +60,7 @@ def published(tmp_path, known, write_scene, write_ply):
     return Bop(path=tmp_path)
 
 
-def test_all_scenes_of_a_split_are_read_in_order_and_in_metres(published, known, making):
+def test_all_scenes_of_a_split_are_read_in_order_and_in_meters(published, known, making):
     made = published.load(NAME, making)
     assert made.mapping.folder == published.path / "train_real"
     assert made.mapping.names == ("000001/rgb/000000.jpg", "000002/rgb/000002.png", "000002/rgb/000010.png")
@@ -70,19 +70,19 @@ def test_all_scenes_of_a_split_are_read_in_order_and_in_metres(published, known,
     assert (made.mapping.cameras[0].width, made.mapping.cameras[0].height) == (80, 60)
 
 
-def test_images_count_that_show_the_object_once_and_well(published, known, making):
+def test_images_that_show_the_object_exactly_once_and_well_are_used(published, known, making):
     made = published.load(NAME, making)
     assert made.query.names == ("000002/rgb/000005.png",)
     known.check(made.query, (5,), [intrinsics(5)])
 
 
-def test_without_visibility_all_that_show_it_once_count(published, making):
+def test_without_visibility_all_images_that_show_it_once_are_used(published, making):
     (published.path / "test" / "000002" / "scene_gt_info.json").unlink()
     query = published.load(NAME, making).query
     assert query.names == ("000002/rgb/000004.png", "000002/rgb/000005.png")
 
 
-def test_box_diameter_and_model_become_metres(published, known, making):
+def test_box_diameter_and_model_are_converted_to_meters(published, known, making):
     made = published.load(NAME, making)
     assert np.allclose(made.box.center, known.box.center)
     assert np.allclose(made.box.half_edges, known.box.half_edges)
@@ -91,7 +91,7 @@ def test_box_diameter_and_model_become_metres(published, known, making):
     assert not made.model.symmetric
 
 
-def test_objects_are_those_that_both_splits_show(published, making):
+def test_objects_are_in_both_splits(published, making):
     assert published.names() == (NAME, "obj_000008")
     assert published.load("obj_000008", making).model.symmetric
     with pytest.raises(InputError, match="test: no image shows obj_000011"):
@@ -100,12 +100,12 @@ def test_objects_are_those_that_both_splits_show(published, making):
         published.load("obj_000001", making)
 
 
-def test_a_step_takes_each_so_manyth_image(published, making):
+def test_a_step_uses_every_nth_image(published, making):
     made = replace(published, frame_step=2).load(NAME, making)
     assert made.mapping.names == ("000001/rgb/000000.jpg", "000002/rgb/000010.png")
 
 
-def test_gray_images_and_other_models_are_read_where_asked(published, known, making, write_scene, write_ply):
+def test_gray_images_and_other_models_are_read(published, known, making, write_scene, write_ply):
     write_scene(published.path / "val" / "000000", {1: [OURS]}, names="gray/{:06d}.tif")
     write_ply(published.path / "models_eval" / f"{NAME}.ply", 990 * known.vertices)
     info = (published.path / "models" / "models_info.json").read_text()
@@ -115,7 +115,7 @@ def test_gray_images_and_other_models_are_read_where_asked(published, known, mak
     assert np.allclose(made.model.vertices, 0.99 * known.vertices)
 
 
-def test_it_travels_to_other_processes(published):
+def test_it_can_be_pickled(published):
     assert pickle.loads(pickle.dumps(published)) == published
 
 
@@ -128,18 +128,18 @@ MODELS = "models/models_info.json"
 DAMAGES = {
     "cut ground truth": (GT, "", "{", "cannot be read as JSON"),
     "ground truth of another kind": (GT, "", [], "must hold a JSON object, got a list"),
-    "image without number": (GT, "x", [], "must have numbers for keys, got 'x'"),
+    "image without number": (GT, "x", [], "must have numeric keys, got 'x'"),
     "image of words": (GT, "5", "none", "image 5, must be a list, got a str"),
     "no object's number": (GT, "5/1/obj_id", None, "image 5, must have an obj_id"),
-    "no rotation": (GT, "5/1/cam_R_m2c", [2, 0, 0, 0, 2, 0, 0, 0, 2], "image 5, is no pose"),
+    "no rotation": (GT, "5/1/cam_R_m2c", [2, 0, 0, 0, 2, 0, 0, 0, 2], "image 5, is not a pose"),
     "short rotation": (GT, "5/1/cam_R_m2c", [1, 0], "image 5, must have cam_R_m2c: 9 numbers"),
     "translation of words": (GT, "5/1/cam_t_m2c", ["a", 0, 0], "image 5, must have cam_t_m2c: 3 numbers"),
     "translation not finite": (GT, "5/1/cam_t_m2c", [float("nan"), 0, 0], "cam_t_m2c: 3 finite numbers"),
     "no camera": (CAMERA, "5", None, "image 5, must have cam_K"),
     "short matrix": (CAMERA, "5/cam_K", [1, 2], "image 5, must have cam_K: 9 numbers"),
     "no focal length": (CAMERA, "5/cam_K", [0, 0, 1, 0, 1, 1, 0, 0, 1], "image 5, must have positive focal"),
-    "no visibility": (INFO, "5", [], "image 5, must have the visib_fract"),
-    "diameter in metres": (MODELS, "5/diameter", 0.14, "object 5, has a diameter .* check the unit"),
+    "no visibility": (INFO, "5", [], "image 5, must have a visib_fract"),
+    "diameter in meters": (MODELS, "5/diameter", 0.14, "object 5, has a diameter .* check the unit"),
     "no extent": (MODELS, "5/size_x", None, "object 5, must have min_x"),
     "negative diameter": (MODELS, "5/diameter", -1, "object 5, must have .* positive"),
     "model of words": (MODELS, "5", "big", "object 5, must be a dict, got a str"),
@@ -147,7 +147,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("path", "place", "value", "message"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_what_is_wrong_in_a_file_is_named(published, making, path, place, value, message):
+def test_a_wrong_entry_is_named_in_the_error(published, making, path, place, value, message):
     file = published.path / path
     data = json.loads(file.read_text())
     *way, last = [int(key) if key in ("0", "1") else key for key in place.split("/")]
@@ -179,34 +179,34 @@ def test_what_is_wrong_in_a_file_is_named(published, making, path, place, value,
         (f"models/{NAME}.ply", "text", "cannot be read as a PLY file"),
     ],
 )
-def test_the_file_that_is_missing_or_damaged_is_named(published, making, damage, path, content, message):
+def test_a_missing_or_damaged_file_is_named_in_the_error(published, making, damage, path, content, message):
     damage(published.path / path, content)
     with pytest.raises(InputError, match=message) as error:
         published.load(NAME, making)
     assert str(published.path / path) in str(error.value)
 
 
-def test_a_model_in_metres_is_refused(published, known, making, write_ply):
+def test_a_model_in_meters_is_an_error(published, known, making, write_ply):
     write_ply(published.path / "models" / f"{NAME}.ply", known.vertices)
-    with pytest.raises(InputError, match=rf"{NAME}\.ply, in millimetres, is 0\.001.* times .*check the unit"):
+    with pytest.raises(InputError, match=rf"{NAME}\.ply, in millimeters, is 0\.001.* times .*check the unit"):
         published.load(NAME, making)
 
 
-def test_splits_that_are_not_there_or_empty_are_named(published, making):
+def test_missing_or_empty_splits_are_named_in_the_error(published, making):
     with pytest.raises(
-        InputError, match="train is no folder: name another split, of models, test, train_real"
+        InputError, match="train is not a folder: choose a split from models, test, train_real"
     ):
         replace(published, mapping_split="train").names()
     (published.path / "val").mkdir()
     with pytest.raises(InputError, match="val holds no scene"):
         replace(published, query_split="val").load(NAME, making)
-    with pytest.raises(ValueError, match="query_split must be another one than mapping_split, got 'test'"):
+    with pytest.raises(ValueError, match="query_split must differ from mapping_split, got 'test'"):
         Bop(path=published.path, mapping_split="test")
     with pytest.raises(ValueError, match="frame_step must be at least 1, got 0"):
         Bop(path=published.path, frame_step=0)
 
 
-def test_splits_without_a_common_object_are_refused(published):
+def test_splits_without_a_common_object_are_an_error(published):
     (published.path / "test" / "000002" / "scene_gt.json").write_text('{"1": [{"obj_id": 11}]}')
     with pytest.raises(
         InputError, match=r"no object of models/models_info\.json is in both train_real and test"

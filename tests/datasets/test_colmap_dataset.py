@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 
 from scenes import exact_map, with_matches
-from slimsfm.datasets.colmap import Colmap
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import map_object
+from slimsfm.datasets.reconstructed import Colmap
 from slimsfm.errors import ImageError, InputError, ModelError
 from slimsfm.features.store import FeatureWriter
 from slimsfm.mapping.map import check_map
@@ -21,7 +21,7 @@ def truth():
 
 @pytest.fixture
 def project(tmp_path, truth, write_image):
-    """A COLMAP project called cup, with hloc's features beside."""
+    """A COLMAP project called cup, with hloc's features next to it."""
     model = tmp_path / "cup" / "sparse" / "0"
     model.mkdir(parents=True)
     truth.model.write(model)
@@ -56,7 +56,7 @@ def assert_is_part_of(sequence, truth, names):
         assert np.array_equal(camera.params, truth.camera(name).params)
 
 
-def test_every_third_image_is_a_query_and_the_others_map(project, truth, making):
+def test_every_third_image_is_a_query_and_the_others_are_for_mapping(project, truth, making):
     made = project.load("cup", making)
     assert made.mapping.folder == made.query.folder == project.images
     queries = ["001.png", "004.png", "007.png"]
@@ -86,15 +86,15 @@ def test_a_file_lists_the_queries(project, truth, making, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("002.png\n099.png\n", "lists '099.png', of which the model has no pose"),
-        ("", "lists 0 of the model's 9 images"),
-        ("".join(f"{k:03d}.png\n" for k in range(1, 9)), "lists 8 of the model's 9 images"),
+        ("002.png\n099.png\n", "lists '099.png', which has no pose in the model"),
+        ("", "lists 0 of the 9 images"),
+        ("".join(f"{k:03d}.png\n" for k in range(1, 9)), "lists 8 of the 9 images"),
         (None, "there is no such file"),
         (b"\xff\xfe\xff", "cannot be read"),
     ],
     ids=["stranger", "none", "too many", "missing", "no text"],
 )
-def test_a_list_that_does_not_fit_is_named(project, making, tmp_path, text, message):
+def test_a_wrong_list_is_named_in_the_error(project, making, tmp_path, text, message):
     listed = tmp_path / "queries.txt"
     if text is not None:
         listed.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -104,7 +104,7 @@ def test_a_list_that_does_not_fit_is_named(project, making, tmp_path, text, mess
 
 
 @pytest.mark.parametrize("place", ["cup/sparse/0", "cup"])
-def test_a_database_in_the_project_gives_the_descriptors(project, truth, making, tmp_path, place):
+def test_descriptors_come_from_a_database_in_the_project(project, truth, making, tmp_path, place):
     write_database(tmp_path / place / "database.db", truth)
     made = replace(project, features=None).load("cup", making)
     assert "descriptors from its database" in made.truth.info.origin
@@ -120,7 +120,7 @@ def test_without_any_descriptors_they_are_computed_from_the_images(rendered, ren
     assert set(made.truth.images) == set(rendered_map.images)
 
 
-def test_an_object_is_called_as_its_project(tmp_path, monkeypatch):
+def test_an_object_has_the_name_of_its_project(tmp_path, monkeypatch):
     for path, name in (("cup/sparse/0", "cup"), ("cup/sparse", "cup"), ("out/sfm", "sfm"), ("cup/0", "cup")):
         assert Colmap(path=tmp_path / path, images=tmp_path).names() == (name,)
     (tmp_path / "cup" / "sparse").mkdir(parents=True)
@@ -128,11 +128,11 @@ def test_an_object_is_called_as_its_project(tmp_path, monkeypatch):
     assert Colmap(path=tmp_path.__class__(os.curdir), images=tmp_path).names() == ("cup",)
 
 
-def test_it_travels_to_other_processes(project):
+def test_it_can_be_pickled(project):
     assert pickle.loads(pickle.dumps(project)) == project
 
 
-def test_two_sources_of_descriptors_are_refused(project, tmp_path):
+def test_two_sources_of_descriptors_are_an_error(project, tmp_path):
     with pytest.raises(ValueError, match="give just one source"):
         replace(project, database=tmp_path / "database.db")
     with pytest.raises(ValueError, match="matches needs features"):
@@ -150,7 +150,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("path", "content", "kind", "message"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_the_file_that_is_wrong_is_named(project, making, damage, tmp_path, path, content, kind, message):
+def test_a_wrong_file_is_named_in_the_error(project, making, damage, tmp_path, path, content, kind, message):
     damage(tmp_path / path, content)
     with pytest.raises(kind, match=message) as error:
         project.load("cup", making)
@@ -158,14 +158,14 @@ def test_the_file_that_is_wrong_is_named(project, making, damage, tmp_path, path
     assert "\n" not in str(error.value)
 
 
-def test_photos_of_another_size_than_the_camera_are_refused(project, making, write_image):
+def test_photos_that_differ_in_size_from_the_camera_are_an_error(project, making, write_image):
     write_image(project.images / "004.png", 320, 240)
-    with pytest.raises(ImageError, match=r"004\.png has 320x240 pixels, but .* 640x480: give the images"):
+    with pytest.raises(ImageError, match=r"004\.png has 320x240 pixels, but .* 640x480: pass the images"):
         project.load("cup", making)
 
 
-def test_too_frequent_queries_and_other_names_are_refused(project, making):
-    with pytest.raises(InputError, match="--query-every 1 leaves 0 references of 9 images"):
+def test_too_frequent_queries_and_unknown_names_are_errors(project, making):
+    with pytest.raises(InputError, match="query_every 1 leaves 0 references of 9 images"):
         replace(project, query_every=1).load("cup", making)
     with pytest.raises(InputError, match="has no object '0'; it has cup"):
         project.load("0", making)

@@ -1,7 +1,8 @@
 import pytest
 
 from scenes import exact_map, with_matches
-from slimsfm.datasets.images import hold_out, query_names
+from slimsfm.datasets.base import hold_out
+from slimsfm.datasets.reconstructed import query_names
 from slimsfm.errors import InputError
 from slimsfm.mapping.map import check_map
 
@@ -19,13 +20,13 @@ def test_every_third_from_the_first_is_a_query():
     [(NAMES, 1), (NAMES, 0), (NAMES, -2), (NAMES[:2], 2), (NAMES[:3], 2), ([], 3)],
     ids=str,
 )
-def test_two_references_and_a_query_are_needed(names, every):
-    with pytest.raises(InputError, match=f"--query-every {every}"):
+def test_two_references_and_a_query_are_required(names, every):
+    with pytest.raises(InputError, match=f"query_every {every}"):
         query_names(names, every)
 
 
 @pytest.mark.parametrize("every", [2, 3, 5])
-def test_what_is_held_out_leaves_nothing_behind(every):
+def test_held_out_images_leave_no_trace(every):
     truth = with_matches(exact_map(num_images=9, reach_deg=60.0))
     queries = query_names(list(truth.images), every)
     references = hold_out(truth, queries)
@@ -40,7 +41,7 @@ def test_what_is_held_out_leaves_nothing_behind(every):
         assert not observers & set(queries)
 
 
-def test_exactly_the_points_that_two_references_see_are_left():
+def test_exactly_the_points_that_two_references_observe_remain():
     truth = exact_map(num_images=9, reach_deg=60.0)
     queries = query_names(list(truth.images), 3)
     seen = [
@@ -53,7 +54,7 @@ def test_exactly_the_points_that_two_references_see_are_left():
     assert 0 < len(expected) < len(truth.point3D_ids)
 
 
-def test_truth_stays_as_it_was():
+def test_the_full_map_is_unchanged():
     truth = exact_map(num_images=9, reach_deg=60.0)
     before = (list(truth.images), len(truth.model.points3D), truth.model.compute_num_observations())
     hold_out(truth, ["001.png", "004.png"])

@@ -34,7 +34,7 @@ def published(tmp_path, known, write_image, write_ply):
     return Linemod(path=tmp_path)
 
 
-def test_real_images_map_and_query_in_metres(published, known, making):
+def test_real_images_are_read_in_meters(published, known, making):
     assert published.names() == ("ape", "eggbox")
     made = published.load("ape", making)
     assert made.mapping.folder == published.path / "real_train" / "ape"
@@ -46,7 +46,7 @@ def test_real_images_map_and_query_in_metres(published, known, making):
     assert (made.query.cameras[0].width, made.query.cameras[0].height) == (640, 480)
 
 
-def test_box_diameter_and_model_become_metres(published, known, making):
+def test_box_diameter_and_model_are_converted_to_meters(published, known, making):
     made = published.load("ape", making)
     assert np.allclose(made.box.center, known.box.center)
     assert np.allclose(made.box.half_edges, known.box.half_edges)
@@ -59,18 +59,18 @@ def test_eggbox_and_glue_are_symmetric(published, making):
     assert not published.load("ape", making).model.symmetric
 
 
-def test_poses_of_four_rows_are_read_too(published, known, making):
+def test_poses_with_four_rows_are_read(published, known, making):
     for path in (published.path / "real_train" / "ape").glob("*-pose.txt"):
         np.savetxt(path, known.matrix(int(path.name[:6])))
     known.check(published.load("ape", making).mapping, (2, 4, 10), [INTRINSICS] * 3)
 
 
-def test_it_travels_to_other_processes(published):
+def test_it_can_be_pickled(published):
     assert pickle.loads(pickle.dumps(published)) == published
 
 
 APE = "1 diameter 140.5 min_x -1 min_y -1 min_z -1 size_x {} size_y 60 size_z 100\n"
-MILLIMETRES = (
+MILLIMETERS = (
     "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     "end_header\n0 0 0\n80 0 0\n0 60 0\n0 0 100\n"
 )
@@ -83,18 +83,18 @@ DAMAGES = {
     "no rotation": ("real_test/ape/000001-pose.txt", "1 0 0 0\n0 1 0 0\n0 0 2 0\n", "rotation"),
     "no image file": ("real_train/ape/000010-color.png", "text", "cannot be read as an image"),
     "no list of models": ("models/models_info.txt", None, "there is no such file"),
-    "not listed": ("models/models_info.txt", APE.format(1).replace("1 d", "2 d", 1), "one line of object 1"),
+    "not listed": ("models/models_info.txt", APE.format(1).replace("1 d", "2 d", 1), "one line for object 1"),
     "no size": ("models/models_info.txt", APE.replace("size_x {}", ""), "must have min_x"),
     "size of words": ("models/models_info.txt", APE.format("long"), "must have min_x"),
     "flat": ("models/models_info.txt", APE.format(0), "positive size"),
-    "model in millimetres": ("models/ape/ape.ply", MILLIMETRES, "in metres, is .*check the unit"),
+    "model in millimeters": ("models/ape/ape.ply", MILLIMETERS, "in meters, is .*check the unit"),
     "no model": ("models/ape/ape.ply", None, "there is no such file"),
     "no ply": ("models/ape/ape.ply", "text", "cannot be read as a PLY file"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("path", "content", "message"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_the_file_that_is_wrong_is_named(published, making, damage, path, content, message):
+def test_a_wrong_file_is_named_in_the_error(published, making, damage, path, content, message):
     damage(published.path / path, content)
     with pytest.raises(InputError, match=message) as error:
         published.load("ape", making)
@@ -103,23 +103,23 @@ def test_the_file_that_is_wrong_is_named(published, making, damage, path, conten
     assert "\n" not in str(error.value)
 
 
-def test_images_of_another_size_are_refused(published, making, write_image):
+def test_images_of_another_size_are_an_error(published, making, write_image):
     for path in (published.path / "real_test" / "ape").glob("*-color.png"):
         write_image(path, 320, 240)
     with pytest.raises(InputError, match=r"000001-color\.png has 320x240 pixels, but LINEMOD's .* 640x480"):
         published.load("ape", making)
 
 
-def test_objects_that_linemod_does_not_have_are_refused(published, making):
+def test_objects_that_linemod_does_not_have_are_an_error(published, making):
     with pytest.raises(InputError, match="has no object 'duck'; it has ape, eggbox"):
         published.load("duck", making)
     (published.path / "real_train" / "teapot").mkdir()
-    with pytest.raises(InputError, match="teapot is called as no object of LINEMOD"):
+    with pytest.raises(InputError, match="teapot does not have the name of a LINEMOD object"):
         published.names()
 
 
-def test_what_is_no_linemod_is_refused(tmp_path):
-    with pytest.raises(InputError, match="real_train is no folder"):
+def test_a_folder_without_linemod_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="real_train is not a folder"):
         Linemod(path=tmp_path).names()
     (tmp_path / "real_train").mkdir()
     with pytest.raises(InputError, match="real_train holds no folder"):

@@ -23,7 +23,7 @@ def write_object(folder, sequences=("cup-1", "cup-2")):
     return folder
 
 
-def test_what_is_written_is_read_back(tmp_path):
+def test_written_sequences_can_be_read(tmp_path):
     read = onepose.read_object(write_object(tmp_path / "cup"))
     assert read.name == "cup"
     assert np.allclose(read.mapping.cameras[0].params, CAMERA.params)
@@ -39,7 +39,7 @@ def test_frames_come_in_the_order_of_their_numbers(tmp_path):
     assert np.asarray(Image.open(read.mapping.image_paths[10]))[0, 0, 0] == 100
 
 
-def test_a_frame_step_takes_each_kth_frame_with_its_pose(tmp_path):
+def test_a_frame_step_uses_every_kth_frame_with_its_pose(tmp_path):
     read = onepose.read_object(write_object(tmp_path / "cup"), frame_step=5)
     assert [path.stem for path in read.query.image_paths] == ["0", "5", "10"]
     assert corner_error(read.query.cam_from_world[2], POSES[10], BOX) < 1e-12
@@ -47,7 +47,7 @@ def test_a_frame_step_takes_each_kth_frame_with_its_pose(tmp_path):
         onepose.read_object(tmp_path / "cup", frame_step=0)
 
 
-def test_the_first_sequence_maps_and_the_last_queries(tmp_path):
+def test_the_first_sequence_is_for_mapping_and_the_last_for_queries(tmp_path):
     read = onepose.read_object(write_object(tmp_path / "cup", ("cup-10", "cup-2", "cup-1")))
     assert read.mapping.image_paths[0].parts[-3] == "cup-1"
     assert read.query.image_paths[0].parts[-3] == "cup-10"
@@ -88,7 +88,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("path", "text", "message"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_a_damaged_file_is_named_with_what_it_must_hold(tmp_path, path, text, message):
+def test_a_damaged_file_is_named_with_its_required_content(tmp_path, path, text, message):
     damaged = write_object(tmp_path / "cup") / path
     damaged.unlink() if text is None else damaged.write_text(text)
     with pytest.raises(InputError, match=message) as error:
@@ -103,13 +103,13 @@ def test_a_damaged_file_is_named_with_what_it_must_hold(tmp_path, path, text, me
         ("cup-1/color_full/7.png", "7.txt has no frame"),
     ],
 )
-def test_a_frame_without_pose_or_a_pose_without_frame_is_named(tmp_path, path, message):
+def test_a_frame_without_pose_or_a_pose_without_frame_is_an_error(tmp_path, path, message):
     (write_object(tmp_path / "cup") / path).unlink()
     with pytest.raises(InputError, match=message):
         onepose.read_object(tmp_path / "cup")
 
 
-def test_a_damaged_image_is_named(tmp_path):
+def test_a_damaged_image_is_named_in_the_error(tmp_path):
     image = onepose.image_path(write_object(tmp_path / "cup") / "cup-1", 0)
     image.write_bytes(b"no image")
     with pytest.raises(ImageError, match="cannot be read as an image") as error:
@@ -117,19 +117,19 @@ def test_a_damaged_image_is_named(tmp_path):
     assert str(image) in str(error.value)
 
 
-def test_one_sequence_is_too_few(tmp_path):
-    with pytest.raises(InputError, match="holds 1 sequences"):
+def test_a_single_sequence_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="holds 1 of the sequences"):
         onepose.read_object(write_object(tmp_path / "cup", ["cup-1"]))
 
 
-def test_a_folder_without_objects_or_no_folder_is_refused(tmp_path):
+def test_a_folder_without_objects_or_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(InputError, match="holds no folder"):
         onepose.object_names(tmp_path)
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         onepose.object_names(tmp_path / "missing")
 
 
-def test_distortion_has_no_place_in_the_layout(tmp_path):
+def test_a_camera_with_distortion_cannot_be_written(tmp_path):
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=16, height=12, params=[15, 8, 6, 0.1])
-    with pytest.raises(ValueError, match="camera must be a pinhole"):
+    with pytest.raises(ValueError, match="camera must be a pinhole camera"):
         onepose.write_annotation(tmp_path, camera, POSES)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slimsfm.datasets.mapping import map_object
+from slimsfm.datasets.base import map_object
 from slimsfm.datasets.onepose import OnePose
 from slimsfm.errors import InputError
 from slimsfm.geometry import project
@@ -42,7 +42,7 @@ def test_full_frames_have_the_camera_of_the_video(published, known, making):
     assert np.array_equal(corners_of(made.box), corners_of(known.box))
 
 
-def test_crops_have_each_a_camera_of_their_own(published, known, making):
+def test_each_crop_has_its_own_camera(published, known, making):
     made = replace(published, frames="cropped").load(NAME, making)
     assert made.mapping.folder == published.path / NAME / "colorbox-1" / "color"
     assert {(camera.width, camera.height) for camera in made.query.cameras} == {(512, 512)}
@@ -50,14 +50,14 @@ def test_crops_have_each_a_camera_of_their_own(published, known, making):
     known.check(made.query, (0, 5, 10, 15), CROPS[::5])
 
 
-def test_two_frames_a_second_are_read_unless_asked_otherwise(published, making):
+def test_two_frames_per_second_are_read_by_default(published, making):
     made = OnePose(path=published.path).load(NAME, making)
     assert made.mapping.names == ("0.png", "15.png")
     with pytest.raises(ValueError, match="frame_step must be at least 1, got 0"):
         OnePose(path=published.path, frame_step=0)
 
 
-def test_objects_are_sorted_and_travel_to_other_processes(published, known, making, write_onepose):
+def test_objects_are_sorted_and_can_be_pickled(published, known, making, write_onepose):
     write_onepose(published.path / "0050-aptamil-box", known, 1, CROPS)
     assert published.names() == ("0050-aptamil-box", NAME)
     travelled = pickle.loads(pickle.dumps(published))
@@ -71,25 +71,25 @@ def test_only_numbered_folders_are_sequences(published, making):
     assert published.load(NAME, making).query.folder.parent.name == "colorbox-10"
 
 
-def test_a_folder_of_splits_and_an_unknown_object_are_refused(published, making):
-    with pytest.raises(InputError, match="holds test_data: give the folder"):
+def test_a_folder_of_splits_and_an_unknown_object_are_errors(published, making):
+    with pytest.raises(InputError, match="holds test_data: pass the folder"):
         OnePose(path=published.path.parent).names()
     with pytest.raises(InputError, match="has no object 'cup'; it has 0408-colorbox-box"):
         published.load("cup", making)
 
 
-def test_where_just_crops_are_published_it_says_how_to_read_them(tmp_path, known, making, write_onepose):
+def test_missing_full_frames_are_an_error_that_mentions_crops(tmp_path, known, making, write_onepose):
     write_onepose(tmp_path / NAME, known, 2, CROPS)
-    with pytest.raises(InputError, match=r"color_full is missing: .*--frames cropped"):
+    with pytest.raises(InputError, match=r"color_full is missing: .*frames: cropped"):
         OnePose(path=tmp_path).load(NAME, making)
     assert OnePose(path=tmp_path, frames="cropped").load(NAME, making).mapping.names == ("0.png",)
 
 
-def test_a_video_with_more_frames_than_poses_is_refused(published, making, write_image):
+def test_a_video_with_more_frames_than_poses_is_an_error(published, making, write_image):
     extra = published.path / NAME / "colorbox-1" / "color_full" / "17.png"
     write_image(extra, 96, 72)
     with pytest.raises(
-        InputError, match=r"17\.png has no pose in poses_ba: .*18 frames.*17 .*--frames cropped"
+        InputError, match=r"17\.png has no pose in poses_ba: .*18 frames.*17 .*frames: cropped"
     ):
         published.load(NAME, making)
     assert len(replace(published, frames="cropped").load(NAME, making).mapping.names) == 4
@@ -101,11 +101,11 @@ DAMAGES = {
     "box of words": ("full", "box3d_corners.txt", "a b c\n" * 8, "8 corners"),
     "no intrinsics": ("full", "colorbox-1/intrinsics.txt", None, "there is no such file"),
     "no focal length": ("full", "colorbox-1/intrinsics.txt", "fx: 0\nfy: 1\ncx: 1\ncy: 1", "positive focal"),
-    "infinite centre": (
+    "infinite principal point": (
         "full",
         "colorbox-10/intrinsics.txt",
         "fx: 1\nfy: 1\ncx: inf\ncy: 1",
-        "finite centre",
+        "finite principal point",
     ),
     "cut frame": ("full", "colorbox-10/color_full/5.png", PNG, "cannot be read as an image"),
     "no pose": ("full", "colorbox-1/poses_ba/3.txt", None, "3.png has no pose"),
@@ -122,7 +122,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("frames", "path", "content", "message"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_the_file_that_is_wrong_is_named(published, making, damage, frames, path, content, message):
+def test_a_wrong_file_is_named_in_the_error(published, making, damage, frames, path, content, message):
     damage(published.path / NAME / path, content)
     with pytest.raises(InputError, match=message) as error:
         replace(published, frames=frames).load(NAME, making)
@@ -131,7 +131,7 @@ def test_the_file_that_is_wrong_is_named(published, making, damage, frames, path
     assert "\n" not in str(error.value)
 
 
-def test_frames_of_several_sizes_are_refused(published, making, write_image):
+def test_frames_of_several_sizes_are_an_error(published, making, write_image):
     write_image(published.path / NAME / "colorbox-1" / "color_full" / "10.png", 48, 36)
     with pytest.raises(InputError, match=r"10\.png has 48x36 pixels, but 0\.png has 96x72"):
         published.load(NAME, making)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from slimsfm.datasets.onepose_lowtexture import OnePoseLowTexture
+from slimsfm.datasets.onepose import OnePoseLowTexture
 from slimsfm.errors import InputError
 
 NAME = "0700-toyrobot-others"
@@ -32,26 +32,26 @@ def test_crops_are_read_as_published(published, known, making):
     assert len(OnePoseLowTexture(path=published.path).load(NAME, making).mapping.names) == 1
 
 
-def test_an_object_has_its_model_where_it_was_scanned(published, known, making):
+def test_a_scanned_object_has_a_model(published, known, making):
     model = published.load(NAME, making).model
     assert np.allclose(model.vertices, known.vertices, atol=1e-7)
     assert (model.diameter, model.symmetric) == (0.14, False)
     assert published.load("0701-yellowduck-others", making).model is None
 
 
-def test_a_diameter_that_is_not_given_is_measured(published, known, making):
+def test_a_missing_diameter_is_computed(published, known, making):
     (published.path / NAME / "diameter.txt").unlink()
     assert published.load(NAME, making).model.diameter == pytest.approx(pdist(known.vertices).max())
 
 
-def test_the_model_for_evaluation_goes_first(published, known, making, write_ply):
+def test_the_model_for_evaluation_has_priority(published, known, making, write_ply):
     write_ply(published.path / NAME / "model.ply", 0.9 * known.vertices)
     assert np.allclose(published.load(NAME, making).model.vertices, known.vertices, atol=1e-7)
     (published.path / NAME / "model_eval.ply").unlink()
     assert np.allclose(published.load(NAME, making).model.vertices, 0.9 * known.vertices, atol=1e-7)
 
 
-def test_it_travels_to_other_processes(published):
+def test_it_can_be_pickled(published):
     assert pickle.loads(pickle.dumps(published)) == published
 
 
@@ -65,14 +65,14 @@ DAMAGES = {
     "not finite": ("model_eval.ply", ENDLESS.replace(b"9", b"1").replace(b"0 0 0", b"0 0 nan"), "finite"),
     "diameter of words": ("diameter.txt", "long", "1 rows of 1"),
     "two diameters": ("diameter.txt", "0.1 0.2", "1 rows of 1"),
-    "diameter in millimetres": ("diameter.txt", "140", "check the unit"),
+    "diameter in millimeters": ("diameter.txt", "140", "check the unit"),
     "no pose": ("toyrobot-2/poses_ba/1.txt", None, "1.png has no pose"),
     "damaged matrix": ("toyrobot-2/intrin_ba/2.txt", "1 0 0\n", "3 rows of 3"),
 }
 
 
 @pytest.mark.parametrize(("path", "content", "message"), DAMAGES.values(), ids=DAMAGES.keys())
-def test_the_file_that_is_wrong_is_named(published, making, damage, path, content, message):
+def test_a_wrong_file_is_named_in_the_error(published, making, damage, path, content, message):
     damage(published.path / NAME / path, content)
     with pytest.raises(InputError, match=message) as error:
         published.load(NAME, making)
@@ -81,21 +81,21 @@ def test_the_file_that_is_wrong_is_named(published, making, damage, path, conten
     assert "\n" not in str(error.value)
 
 
-def test_a_cut_binary_model_is_refused(published, making, damage):
+def test_a_truncated_binary_model_is_an_error(published, making, damage):
     path = published.path / NAME / "model_eval.ply"
     damage(path, path.read_bytes()[:-100])
     with pytest.raises(InputError, match=r"model_eval\.ply"):
         published.load(NAME, making)
 
 
-def test_a_model_in_millimetres_is_refused(published, known, making, write_ply):
+def test_a_model_in_millimeters_is_an_error(published, known, making, write_ply):
     write_ply(published.path / NAME / "model_eval.ply", 1000 * known.vertices)
     with pytest.raises(
-        InputError, match=r"model_eval\.ply, in metres, is .* times as large .*check the unit"
+        InputError, match=r"model_eval\.ply, in meters, is .* times as large .*check the unit"
     ):
         published.load(NAME, making)
 
 
-def test_a_bad_step_is_named(tmp_path):
+def test_an_invalid_step_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="frame_step must be at least 1, got -1"):
         OnePoseLowTexture(path=tmp_path, frame_step=-1)

@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from slimsfm.datasets.object_model import largest_distance
-from slimsfm.datasets.reading import folders, image_size, numbered, pinhole, rigid
+from slimsfm.datasets.reading import folders, image_size, numbered, pinhole_camera, rigid
 from slimsfm.errors import InputError
 from slimsfm.synthetic.trajectory import mapping_path
 
@@ -11,7 +11,7 @@ SIDEWAYS = 6  # EXIF's orientation of a photo taken upright
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
-def test_the_size_of_an_image_is_that_of_its_upright_pixels(tmp_path, suffix):
+def test_the_size_of_an_image_follows_its_exif_rotation(tmp_path, suffix):
     exif = Image.Exif()
     exif[0x0112] = SIDEWAYS
     Image.new("RGB", (64, 48)).save(tmp_path / f"plain{suffix}")
@@ -20,7 +20,7 @@ def test_the_size_of_an_image_is_that_of_its_upright_pixels(tmp_path, suffix):
     assert image_size(tmp_path / f"turned{suffix}") == (48, 64)
 
 
-def test_a_rounded_rotation_becomes_one_again():
+def test_a_rounded_rotation_is_normalized():
     pose = mapping_path(5, 0.5)[2]
     read = rigid(pose.matrix().round(4), "file")
     rotation = read.matrix()[:, :3]
@@ -28,8 +28,8 @@ def test_a_rounded_rotation_becomes_one_again():
     assert np.allclose(read.matrix(), pose.matrix(), atol=1e-3)
 
 
-def test_the_centre_of_the_first_pixel_moves_by_half_a_pixel():
-    camera = pinhole(np.array([[100.0, 0, 0], [0, 100, 0], [0, 0, 1]]), (64, 48), "file")
+def test_the_center_of_the_first_pixel_moves_by_half_a_pixel():
+    camera = pinhole_camera(np.array([[100.0, 0, 0], [0, 100, 0], [0, 0, 1]]), (64, 48), "file")
     assert np.allclose(camera.img_from_cam(np.array([[0.0, 0, 1]])), (0.5, 0.5))
 
 
@@ -48,7 +48,7 @@ def test_folders_and_files_come_in_the_order_of_their_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("flat", [False, True], ids=["solid", "flat"])
-def test_the_largest_distance_is_that_of_the_farthest_two(flat):
+def test_the_largest_distance_agrees_with_brute_force(flat):
     points = np.random.default_rng(0).normal(size=(200, 3)) * (1, 1, 0 if flat else 1)
     expected = np.linalg.norm(points[:, None] - points[None], axis=2).max()
     assert largest_distance(points) == pytest.approx(expected)

@@ -15,7 +15,7 @@ def dataset(request, tmp_path):
     return kind(path=tmp_path, **asked)
 
 
-def test_every_data_set_lies_somewhere_and_is_a_constant(dataset, tmp_path):
+def test_every_data_set_has_a_path_and_is_immutable(dataset, tmp_path):
     assert isinstance(dataset, Dataset)
     assert fields(dataset)[0].name == "path"
     assert dataset.path == tmp_path
@@ -23,7 +23,7 @@ def test_every_data_set_lies_somewhere_and_is_a_constant(dataset, tmp_path):
         dataset.path = Path("elsewhere")
 
 
-def test_every_data_set_travels_to_other_processes(dataset):
+def test_every_data_set_can_be_pickled(dataset):
     assert pickle.loads(pickle.dumps(dataset)) == dataset
     assert hash(dataset) == hash(pickle.loads(pickle.dumps(dataset)))
 

@@ -1,10 +1,11 @@
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from slimsfm.datasets.synthetic import SynthesisOptions, _take, synthesize
+from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.errors import OutputError
 from slimsfm.geometry import project
 
@@ -23,7 +24,7 @@ def written(tmp_path_factory):
     return folder, synthesize(folder, OPTIONS)
 
 
-def test_objects_are_read_back_with_frames_that_show_them(written):
+def test_rendered_objects_are_read_with_frames_that_show_them(written):
     _, (item,) = written
     assert item.name == "can"
     assert (len(item.mapping.image_paths), len(item.query.image_paths)) == (3, 2)
@@ -34,13 +35,13 @@ def test_objects_are_read_back_with_frames_that_show_them(written):
 
 
 def test_equal_options_give_equal_bytes_wherever_frames_are_rendered(written, tmp_path):
-    _take.cache_clear()  # nothing may depend on what was rendered before
+    synthesize(tmp_path / "other", replace(OPTIONS, seed=OPTIONS.seed + 1))  # replaces what is cached
     with ThreadPoolExecutor(2) as executor:
-        synthesize(tmp_path, OPTIONS, executor=executor)
-    assert contents(tmp_path) == contents(written[0])
+        synthesize(tmp_path / "again", OPTIONS, executor=executor)
+    assert contents(tmp_path / "again") == contents(written[0])
 
 
-def test_an_object_that_is_there_is_replaced_only_when_allowed(tmp_path):
+def test_an_existing_object_is_replaced_only_with_overwrite(tmp_path):
     old = tmp_path / "can" / "notes.txt"
     old.parent.mkdir()
     old.write_text("mine")
@@ -51,7 +52,7 @@ def test_an_object_that_is_there_is_replaced_only_when_allowed(tmp_path):
     assert not old.exists()
 
 
-def test_progress_sees_each_frame_and_an_interruption_leaves_nothing(tmp_path):
+def test_progress_counts_frames_and_an_interruption_leaves_no_files(tmp_path):
     seen = []
 
     def interrupt(items, label):
@@ -79,6 +80,6 @@ def test_progress_sees_each_frame_and_an_interruption_leaves_nothing(tmp_path):
     ],
     ids=str,
 )
-def test_bad_options_are_named(values):
+def test_invalid_options_are_named_in_the_error(values):
     with pytest.raises(ValueError, match=next(iter(values))):
         SynthesisOptions(**values)

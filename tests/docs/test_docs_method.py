@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from slimsfm.domination import exact, random_greedy
-from slimsfm.evaluation import statistics
 from slimsfm.geometry import ADD_FRACTIONS
+from slimsfm.evaluation import scores
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions
@@ -41,7 +41,7 @@ def test_the_weights_of_the_confidence_match_the_code():
         ("$c < {:g}$ is discarded", LocalizationOptions().min_confidence),
         ("inliers within {:g} px", RansacOptions().max_error_px),
         (r"\sigma_0 = {:g}", problem.PRIOR_SIGMA),
-        ("resampled with replacement, {:g} times", statistics._RESAMPLES),
+        ("resampled with replacement, {:g} times", scores._RESAMPLES),
         ("the smallest of {:g} |", default(random_greedy, "draws")),
         ("Up to {:g} references", forecast._MOST_TESTS),
     ],

@@ -1,4 +1,4 @@
-"""Results made by hand, for tests of what is computed from them."""
+"""Handmade results as input for tests."""
 
 from pathlib import Path
 
@@ -6,9 +6,8 @@ import numpy as np
 import pycolmap
 
 from scenes import BOX
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.protocol import Query
-from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Run, Trial
+from slimsfm.evaluation.protocol import PosedQuery
+from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, Outcomes, Run
 
 FULL, DOMINATING = ("sift", "exhaustive", "full"), ("sift", "exhaustive", "dominating")
 
@@ -25,7 +24,7 @@ def random_pose(rng):
 
 
 def outcomes_like(errors, *, confidence=0.95, references=3, seconds=(0.01, 0.02, 0.005)):
-    """Outcomes with these relative errors, a hundred times as many degrees, and as many metres."""
+    """Outcomes with these relative errors, also as meters, and times 100 as degrees."""
     errors = np.array(errors, np.float64)
     found = np.isfinite(errors)
     return Outcomes(
@@ -39,21 +38,21 @@ def outcomes_like(errors, *, confidence=0.95, references=3, seconds=(0.01, 0.02,
     )
 
 
-def trial_like(errors, *, references=4, points=100, map_bytes=1000, **how):
+def map_run_like(errors, *, references=4, points=100, map_bytes=1000, **how):
     outcomes = outcomes_like(errors, **how)
-    return Trial(references=references, points=points, map_bytes=map_bytes, outcomes=outcomes)
+    return MapRun(references=references, points=points, map_bytes=map_bytes, outcomes=outcomes)
 
 
-def cell_like(key, *draws, **how):
-    """One line, each draw a list of errors."""
+def measurement_like(key, *draws, **how):
+    """One measurement; each draw is a list of errors."""
     method, strategy, variant = key
-    trials = tuple(trial_like(errors, **how) for errors in draws)
-    return Cell(method=method, strategy=strategy, variant=variant, trials=trials)
+    trials = tuple(map_run_like(errors, **how) for errors in draws)
+    return Measurement(method=method, strategy=strategy, variant=variant, map_runs=trials)
 
 
 def result_like(name, *cells, unit="metre", queries=None):
-    """An object of these lines."""
-    count = len(cells[0].trials[0].outcomes)
+    """An object with these measurements."""
+    count = len(cells[0].map_runs[0].outcomes)
     names = queries or [f"{number}.png" for number in range(count)]
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
     return ObjectResult(
@@ -62,10 +61,10 @@ def result_like(name, *cells, unit="metre", queries=None):
         unit=unit,
         images=Path("photos"),
         queries=tuple(
-            Query(path=Path("queries", one), camera=camera, cam_from_world=rigid()) for one in names
+            PosedQuery(path=Path("queries", one), camera=camera, cam_from_world=rigid()) for one in names
         ),
         maps=(mapped_like("sift"),),
-        cells=cells,
+        measurements=cells,
     )
 
 

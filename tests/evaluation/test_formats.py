@@ -5,25 +5,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from handmade import DOMINATING, FULL, cell_like, mapped_like, result_like, run_like
+from handmade import DOMINATING, FULL, mapped_like, measurement_like, result_like, run_like
 
-from slimsfm.evaluation.columns import MAP, number, size
-from slimsfm.evaluation.comparison import against_full
+from slimsfm.evaluation.comparison import against_full, summarize_domination
 from slimsfm.evaluation.formats import (
-    all_rows,
     csv_queries,
     csv_table,
-    is_metric,
+    format_p_value,
+    format_value,
     latex_table,
     markdown_comparisons,
     markdown_page,
     markdown_summaries,
     markdown_table,
-    p_value,
-    shown,
 )
-from slimsfm.evaluation.summary import summarize_domination
-from slimsfm.evaluation.table import average_rows, rows_of
+from slimsfm.evaluation.table import (
+    MAP_COLUMNS,
+    all_rows,
+    average_rows,
+    format_bytes,
+    format_number,
+    is_metric,
+    rows_of,
+)
 
 DASH, TIMES = "\N{EN DASH}", "\N{MULTIPLICATION SIGN}"
 RANDOM = ("sift", "exhaustive", "random:k=2,rim")
@@ -32,11 +36,11 @@ AWKWARD = "0408_box & 50%|{x}~^$#\\"
 
 @pytest.fixture(scope="module")
 def run():
-    """An object in centimetres whose name is awkward, one of unknown scale, and one that failed."""
+    """A metric object with an awkward name, one of unknown scale, and one that failed."""
     cells = [
-        cell_like(FULL, [0.01, 0.02, np.inf], references=1234, map_bytes=24_000_000),
-        cell_like(DOMINATING, [0.01, 0.2, 0.03]),
-        cell_like(RANDOM, [np.inf] * 3, [0.01, np.inf, 0.03]),
+        measurement_like(FULL, [0.01, 0.02, np.inf], references=1234, map_bytes=24_000_000),
+        measurement_like(DOMINATING, [0.01, 0.2, 0.03]),
+        measurement_like(RANDOM, [np.inf] * 3, [0.01, np.inf, 0.03]),
     ]
     objects = [result_like(AWKWARD, *cells), result_like("mug", *cells, unit="unknown")]
     return run_like(*objects, failed={"jar": "jar/box3d_corners.txt is missing"})
@@ -53,7 +57,7 @@ def comparisons(run):
 
 
 def cells_of(line):
-    """The cells of a line of a Markdown table; an escaped bar parts none."""
+    """The cells of a line of a Markdown table; an escaped bar is not a separator."""
     assert line.startswith("|")
     assert line.endswith("|")
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
@@ -64,7 +68,7 @@ def tables_in(text):
     return [block.splitlines() for block in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE)]
 
 
-def test_every_line_of_a_markdown_table_has_as_many_cells(run, rows, comparisons):
+def test_every_line_of_a_markdown_table_has_the_same_number_of_cells(run, rows, comparisons):
     texts = {
         markdown_table(rows): len(rows),
         markdown_comparisons(comparisons): len(comparisons),
@@ -89,7 +93,7 @@ def test_markdown_shows_values_with_the_interval_of_the_accuracy(run):
     assert shown_values["FPS"] == "28.6"
 
 
-def test_what_has_no_value_is_a_dash(rows):
+def test_a_missing_value_is_a_dash(rows):
     (lines,) = tables_in(markdown_table(rows))
     header = cells_of(lines[0])
     rows = [dict(zip(header, cells_of(line), strict=True)) for line in lines[2:]]
@@ -97,34 +101,34 @@ def test_what_has_no_value_is_a_dash(rows):
     assert DASH not in {row["5°-5cm"] for row in rows if row["Object"].startswith("0408")}
 
 
-def test_without_a_metric_object_there_are_no_columns_of_centimetres(run):
+def test_without_a_metric_object_there_are_no_centimeter_columns(run):
     rows = rows_of(run.objects[1])
     assert not is_metric(rows)
     assert "cm" not in markdown_table(rows)
     assert "cm" not in latex_table(rows, "toys")
 
 
-def test_comparisons_tell_direction_and_doubt(run):
+def test_comparisons_show_direction_and_uncertainty(run):
     (lines,) = tables_in(markdown_comparisons(against_full(run.objects[:1])))
     first = dict(zip(cells_of(lines[0]), cells_of(lines[2]), strict=True))
-    assert first["Line"] == "sift, exhaustive, dominating"
-    assert first["against"] == "sift, exhaustive, full"
+    assert first["Row"] == "sift, exhaustive, dominating"
+    assert first["Baseline"] == "sift, exhaustive, full"
     assert first["ADD-0.1d"] == "66.7 → 66.7"
     assert first["p"] == "1.000"
     assert first["faster"] == f"1.0{TIMES} (1.0 to 1.0)"
     assert first["smaller"] == f"24000.0{TIMES}"
 
 
-def test_small_probabilities_are_not_called_zero():
-    assert [p_value(value) for value in (1.0, 0.05, 0.001, 0.00099, 0.0)] == [
+def test_small_probabilities_are_not_rounded_to_zero():
+    assert [format_p_value(value) for value in (1.0, 0.05, 0.001, 0.00099, 0.0)] == [
         *("1.000", "0.050", "0.001"),
         *("< 0.001", "< 0.001"),
     ]
 
 
-def test_intervals_are_shown_where_there_are_some(run):
+def test_a_value_without_an_interval_is_shown_alone(run):
     row = rows_of(run.objects[0])[0]
-    assert shown(row, MAP[0], interval=True) == "1,234"
+    assert format_value(row, MAP_COLUMNS[0], interval=True) == "1,234"
 
 
 ENVIRONMENT = re.compile(r"\\(begin|end)\{([a-z*]+)\}")
@@ -170,7 +174,7 @@ def test_latex_is_balanced_and_has_the_columns_of_the_papers_table(run):
     assert "\\caption{TinyDataset toys\\_2}" in latex
 
 
-def test_latex_escapes_what_it_would_take_for_commands(rows):
+def test_latex_escapes_special_characters(rows):
     latex = latex_table(rows, "50 % of 3° at _")
     assert_balanced(latex)
     assert r"0408\_box \& 50\%|\{x\}\textasciitilde{}\^{}\$\#\textbackslash{}: sift" in latex
@@ -179,7 +183,7 @@ def test_latex_escapes_what_it_would_take_for_commands(rows):
     assert not re.search(r"(?<!\\)[%#]|(?<!\\)_", latex)
 
 
-def test_latex_rules_part_objects_and_name_slim_maps(rows):
+def test_latex_separates_objects_with_rules_and_names_variants(rows):
     latex = latex_table(rows, "toys")
     assert latex.count("\\midrule") == 1 + (4 - 1)  # below the header; two averages and two objects
     assert "mug: sift, exhaustive &" in latex
@@ -203,8 +207,8 @@ def test_the_csv_of_queries_has_every_query_of_every_draw(run):
     wanted = [
         (result, cell, draw, trial.outcomes, i)
         for result in run.objects
-        for cell in result.cells
-        for draw, trial in enumerate(cell.trials)
+        for cell in result.measurements
+        for draw, trial in enumerate(cell.map_runs)
         for i in range(3)
     ]
     for line, (result, cell, draw, outcomes, i) in zip(lines, wanted, strict=True):
@@ -221,13 +225,13 @@ def test_without_objects_there_are_no_queries():
     assert csv_queries([]) == "\n"
 
 
-def test_the_page_tells_all(run, rows, comparisons):
+def test_the_page_has_all_tables(run, rows, comparisons):
     page = markdown_page(run, rows, comparisons)
     assert page.startswith("# TinyDataset toys\n")
-    assert "**jar could not be measured**: jar/box3d_corners.txt is missing" in page
+    assert "**jar failed**: jar/box3d_corners.txt is missing" in page
     assert "- cpu: abacus\n- python: 3.99\n" in page
     assert [len(table) - 2 for table in tables_in(page)] == [len(rows), len(comparisons), 1]
-    assert "could not be measured" not in markdown_page(replace(run, failed={}), rows, comparisons)
+    assert "failed" not in markdown_page(replace(run, failed={}), rows, comparisons)
 
 
 def test_averages_come_first(run, rows):
@@ -242,8 +246,8 @@ def test_sizes_of_dominating_sets_are_shown(run):
     assert cells_of(lines[2]) == ["sift", "2", "2", "3.00", "4", "0.150", "0.150", "0.325", "0.325"]
 
 
-def test_counts_and_sizes_are_written_in_the_unit_that_suits_them():
-    assert [number(value) for value in (7.0, 12_345.0, 3.25)] == ["7", "12,345", "3.2"]
-    assert [size(value) for value in (0, 999, 1000, 9_949, 24e6, 999.6e6, 5e12)] == [
+def test_counts_and_sizes_have_a_suitable_unit():
+    assert [format_number(value) for value in (7.0, 12_345.0, 3.25)] == ["7", "12,345", "3.2"]
+    assert [format_bytes(value) for value in (0, 999, 1000, 9_949, 24e6, 999.6e6, 5e12)] == [
         *("0 B", "999 B", "1.0 kB", "9.9 kB", "24 MB", "1.0 GB", "5000 GB"),
     ]

@@ -5,21 +5,21 @@ import pytest
 
 from scenes import algorithm_1, exact_map
 from slimsfm.domination import dominates
-from slimsfm.evaluation.variants import VARIANTS, Making, parse_variant
+from slimsfm.evaluation.variants import VARIANTS, VariantInputs, parse_variant
 from slimsfm.mapping.io import weigh_map
 from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
 
 
 @pytest.fixture(scope="module")
 def narrow():
-    """Ten images, none of which sees all of the points."""
+    """Ten images; no image sees all points."""
     return exact_map(num_images=10, num_points=400, reach_deg=65.0)
 
 
 @pytest.fixture(scope="module")
 def making(narrow):
     graph, reduction = algorithm_1(narrow), ReductionOptions()
-    return Making(
+    return VariantInputs(
         map=narrow,
         graph=graph,
         reduction=reduction,
@@ -29,7 +29,7 @@ def making(narrow):
 
 
 def chosen(making, text):
-    """Indices of the images that the one map of a variant keeps."""
+    """Indices of the images in the only map of a variant."""
     (made,) = parse_variant(text).make(making)
     return [making.graph.names.index(name) for name in made.images]
 
@@ -60,7 +60,7 @@ def test_a_variant_is_a_name_with_or_without_settings(text):
 
 
 @pytest.mark.parametrize("text", ["", "half", "FULL", ":8", "full2", "dominating k=2"])
-def test_an_unknown_variant_is_named(text):
+def test_an_unknown_variant_is_an_error(text):
     with pytest.raises(ValueError, match=r"variants must be among full, .*, got '.*'"):
         parse_variant(text)
 
@@ -78,7 +78,7 @@ def test_an_unknown_variant_is_named(text):
         "points:300,kcover,kcover",
     ],
 )
-def test_a_setting_that_a_variant_does_not_take_is_named(text):
+def test_an_invalid_setting_of_a_variant_is_an_error(text):
     kind = text.partition(":")[0]
     with pytest.raises(ValueError, match=f"variants: {kind} takes ") as caught:
         parse_variant(text)
@@ -91,7 +91,7 @@ def test_full_is_the_map_itself(making):
     assert made is making.map
 
 
-def test_a_dominating_set_is_the_one_that_was_chosen(making):
+def test_the_dominating_variant_is_the_given_solution(making):
     found = chosen(making, "dominating")
     assert sorted(found) == sorted(making.solution.chosen)
     assert dominates(making.graph.adjacency(), found)
@@ -99,7 +99,7 @@ def test_a_dominating_set_is_the_one_that_was_chosen(making):
 
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_a_set_that_dominates_k_times_localizes_each_other_image_from_k(making, k):
-    """Or from all that can, where there are fewer."""
+    """Or from all images that can, if there are fewer."""
     found, adjacency = chosen(making, f"dominating:k={k}"), making.graph.adjacency().toarray()
     np.fill_diagonal(adjacency, val=False)
     others = np.setdiff1d(np.arange(len(adjacency)), found)
@@ -107,23 +107,23 @@ def test_a_set_that_dominates_k_times_localizes_each_other_image_from_k(making, 
     assert len(found) == len(dominating_set(making.graph, ReductionOptions(dominators=k), making.map).chosen)
 
 
-def test_a_budget_is_kept(making):
+def test_a_budget_is_respected(making):
     assert len(making.solution.chosen) > 1
     assert len(chosen(making, "dominating:budget=1")) == 1
 
 
 def test_a_stricter_threshold_takes_more_images(making):
-    """On an exact scene errors are rounding alone: no image localizes another that well."""
+    """In an exact scene errors are only rounding, but still larger than this threshold."""
     assert len(chosen(making, "dominating:threshold=1e-12")) == 10
 
 
-def test_settings_replace_those_of_the_benchmark_and_leave_the_others(making):
+def test_settings_override_only_their_own_options(making):
     strict = replace(making, reduction=ReductionOptions(threshold=1e-12))
     assert len(chosen(strict, "dominating:k=2")) == 10
     assert len(chosen(strict, "dominating:threshold=0.05")) == len(making.solution.chosen)
 
 
-def test_random_variants_are_five_draws_of_as_many_images_as_the_dominating_set(making):
+def test_random_variants_are_five_draws_with_the_size_of_the_dominating_set(making):
     count = len(making.solution.chosen)
     draws = parse_variant("random").make(making)
     expected = [keep_random_images(making.map, count, seed=seed) for seed in range(5)]
@@ -131,30 +131,30 @@ def test_random_variants_are_five_draws_of_as_many_images_as_the_dominating_set(
     assert len({tuple(one.images) for one in draws}) > 1
 
 
-def test_random_variants_are_as_large_as_they_are_told(making):
+def test_random_variants_have_the_given_size(making):
     draws = parse_variant("random:3").make(making)
     assert [len(one.images) for one in draws] == [3] * 5
 
 
-def test_more_images_than_there_are_make_no_random_variant(making):
+def test_a_random_variant_larger_than_the_map_is_left_out(making):
     assert len(parse_variant("random:10").make(making)) == 5
     assert parse_variant("random:11").make(making) == []
 
 
 @pytest.mark.parametrize("text", ["points:300", "points:300,kcover"])
-def test_points_are_as_many_as_they_are_told_for_direct_matching(making, text):
+def test_the_points_variant_has_the_given_size(making, text):
     (made,) = parse_variant(text).make(making)
     assert len(made.point3D_ids) == 300
     assert made.is_for_direct_matching
     assert set(made.point3D_ids) <= set(making.map.point3D_ids)
 
 
-def test_more_points_than_there_are_keep_all(making):
+def test_a_points_variant_larger_than_the_map_keeps_all_points(making):
     (made,) = parse_variant("points:100000").make(making)
     assert len(made.point3D_ids) == len(making.map.point3D_ids)
 
 
 @pytest.mark.parametrize("text", ["default", "points:300"])
-def test_a_map_without_keypoints_has_no_points_to_match_directly(making, text):
+def test_a_map_without_keypoints_has_no_variant_for_direct_matching(making, text):
     keypoint_free = replace(making.map, info=replace(making.map.info, extractor="loftr"))
     assert parse_variant(text).make(replace(making, map=keypoint_free)) == []

@@ -1,6 +1,6 @@
 import pytest
 
-from slimsfm.evaluation.methods import Method, parse_method
+from slimsfm.evaluation.benchmark import Method, parse_method
 
 
 @pytest.mark.parametrize(
@@ -20,12 +20,12 @@ def test_a_method_is_an_extractor_with_or_without_a_matcher(text, method):
 
 
 @pytest.mark.parametrize("text", ["", "guess", "lightglue", "SIFT", "+lightglue", "guess+lightglue", " sift"])
-def test_an_unknown_extractor_is_named(text):
-    with pytest.raises(ValueError, match=r"methods must be made of .*sift.*, got '.*'"):
+def test_an_unknown_extractor_is_an_error(text):
+    with pytest.raises(ValueError, match=r"the extractor of a method must be one of .*sift.*, got '.*'"):
         parse_method(text)
 
 
 @pytest.mark.parametrize("text", ["aliked+", "aliked+guess", "aliked+sift", "aliked+lightglue+superglue"])
-def test_an_unknown_matcher_is_named(text):
+def test_an_unknown_matcher_is_an_error(text):
     with pytest.raises(ValueError, match=r"the matcher of a method must be one of .*lightglue.*, got '.*'"):
         parse_method(text)

@@ -8,33 +8,24 @@ from handmade import random_pose, rigid
 
 from scenes import BOX
 from slimsfm.datasets.base import ObjectModel
-from slimsfm.evaluation.metrics import (
-    NO_POSE,
-    PoseError,
-    add_percent,
-    deg_cm_percent,
-    errors_of_poses,
-    model_error,
-    pose_error,
-    within_deg_cm,
-    wrong_when_sure,
-)
+from slimsfm.evaluation.protocol import NO_POSE, PoseError, model_error, pose_error
+from slimsfm.evaluation.scores import add_percent, deg_cm_percent, within_deg_cm, wrong_when_sure
 from slimsfm.geometry import Box
 
 DIAGONAL = 2 * np.sqrt(1.0**2 + 0.8**2 + 0.6**2)
 PILLAR = np.array([[1, 2, 0], [-1, -2, 0], [2, -1, 3], [-2, 1, 3], [0, 0, 5], [0, 0, -5]], np.float64)
-"""Vertices that half a turn about z leaves as they are."""
+"""Vertices that are invariant under half a turn about z."""
 
 
 def model_of(vertices, *, symmetric=False, diameter=10.0):
     return ObjectModel(vertices=np.array(vertices, np.float64), diameter=diameter, symmetric=symmetric)
 
 
-# The published formulas, as they are usually written down.
+# The published formulas in their usual form.
 
 
 def angle_by_trace(a, b):
-    """The arc cosine of the trace, cut off where rounding takes it beyond what has an arc cosine."""
+    """The arc cosine of the trace, clipped against rounding."""
     trace = np.trace(a.rotation.matrix() @ b.rotation.matrix().T)
     return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
@@ -48,7 +39,7 @@ def add_by_hand(estimated, true, points):
 
 
 def adds_by_hand(estimated, true, points):
-    """From each point under the true pose to each under the other, of which the least counts."""
+    """Mean over true points of the smallest distance to any estimated point."""
     offsets = moved(true, points)[:, None] - moved(estimated, points)[None]
     return np.mean(np.min(np.sqrt(np.sum(offsets**2, axis=2)), axis=1))
 
@@ -60,7 +51,7 @@ def test_errors_agree_with_the_published_formulas_on_a_thousand_poses():
     compared = 0
     for number in range(1000):
         true = random_pose(rng)
-        # every other estimate is a near one
+        # every second estimate is close to the truth
         estimated = random_pose(rng) if number % 2 else near(true, rng)
         found = pose_error(estimated, true, BOX)
         angle = angle_by_trace(estimated, true)
@@ -111,8 +102,8 @@ def test_a_turn_about_z_moves_every_corner_along_its_chord(angle_deg):
 
 
 @pytest.mark.parametrize("angle", [1e-8, 1e-7, np.pi - 1e-7, np.pi - 1e-8], ids=str)
-def test_angles_near_0_and_180_degrees_are_known_to_a_billionth_of_a_radian(angle):
-    """There the cosine hardly changes, so the formula by the trace loses half of the digits."""
+def test_angles_near_0_and_180_degrees_are_accurate_to_a_billionth_of_a_radian(angle):
+    """There the cosine is flat, so the formula with the trace loses half of the digits."""
     rng = np.random.default_rng(1)
     ours, by_trace = [], []
     for _ in range(50):
@@ -124,8 +115,8 @@ def test_angles_near_0_and_180_degrees_are_known_to_a_billionth_of_a_radian(angl
     assert np.abs(np.array(by_trace) - angle).max() > 1e-9
 
 
-def test_a_matrix_whose_trace_is_over_three_is_no_turn_at_all():
-    """Rounding makes such matrices, of which the arc cosine knows nothing unless it is cut off."""
+def test_a_rotation_with_trace_above_three_has_angle_zero():
+    """Rounding can produce such a matrix, whose arc cosine is NaN without clipping."""
     rounded = np.eye(3) * (1 + 1e-12)
     assert np.trace(rounded) > 3
     with np.errstate(invalid="ignore"):
@@ -140,26 +131,26 @@ def test_a_pose_and_its_opposite_quaternion_are_the_same():
     assert pose_error(opposite, pose, BOX).rotation_deg == 0.0
 
 
-def test_half_a_turn_of_a_symmetric_object_is_no_error_but_for_one_that_is_not_symmetric():
+def test_half_a_turn_is_an_error_only_for_an_asymmetric_object():
     half_a_turn = rigid(angle_deg=180.0)
     assert model_error(half_a_turn, rigid(), model_of(PILLAR, symmetric=True)) == pytest.approx(0, abs=1e-15)
     assert model_error(half_a_turn, rigid(), model_of(PILLAR)) == pytest.approx(
-        4 * 2 * np.sqrt(5) / 6 / 10  # four of six vertices change places with those across
+        4 * 2 * np.sqrt(5) / 6 / 10  # four of six vertices swap with their opposites
     )
 
 
-def test_a_quarter_of_a_turn_is_an_error_of_an_object_that_half_a_turn_leaves_as_it_is():
+def test_a_quarter_turn_is_an_error_for_an_object_with_half_turn_symmetry():
     assert model_error(rigid(angle_deg=90.0), rigid(), model_of(PILLAR, symmetric=True)) > 0.01
 
 
-def test_the_nearest_vertex_is_sought_of_each_vertex_where_it_truly_is():
-    """True at 0, 1 and 10, thought to be at 9, 10 and 19: 9, 8 and 0; the other way it were 1, 0 and 9."""
+def test_adds_searches_the_nearest_estimated_vertex_of_each_true_vertex():
+    """True at 0, 1, 10, estimated at 9, 10, 19: distances 9, 8, 0; in the other direction 1, 0, 9."""
     line = model_of([[0, 0, 0], [1, 0, 0], [10, 0, 0]], symmetric=True)
     assert model_error(rigid(translation=(9, 0, 0)), rigid(), line) == pytest.approx(17 / 3 / 10)
 
 
 def test_the_diagonal_is_the_largest_distance_of_two_corners_of_any_box():
-    """Turned, sheared or flat: without right angles diagonals differ, and the longest counts."""
+    """Rotated, sheared or flat: without right angles the diagonals differ, and the longest one counts."""
     rng = np.random.default_rng(2)
     edges = [rng.normal(size=(3, 3)) for _ in range(50)]
     edges += [np.diag([1.0, 0.0, 0.0]), np.diag([3.0, 2.0, 1.0]) @ random_pose(rng).rotation.matrix()]
@@ -172,7 +163,7 @@ def test_the_diagonal_is_the_largest_distance_of_two_corners_of_any_box():
         assert pose_error(shift, rigid(), box).relative == pytest.approx(0.1)
 
 
-def test_errors_are_relative_to_the_diameter_that_comes_with_the_model():
+def test_errors_are_relative_to_the_diameter_of_the_model():
     shift = rigid(translation=(0, 0, 1.0))
     for diameter in (5.0, 20.0):
         model = model_of(PILLAR, diameter=diameter)
@@ -182,7 +173,7 @@ def test_errors_are_relative_to_the_diameter_that_comes_with_the_model():
 @pytest.mark.parametrize("model", [None, model_of(PILLAR), model_of(PILLAR, symmetric=True)])
 def test_no_pose_is_infinitely_wrong_and_counts_as_failure(model):
     assert pose_error(None, rigid(), BOX, model) is NO_POSE
-    errors = errors_of_poses([None, rigid(), rigid(), None], [rigid()] * 4, BOX, model)
+    errors = [pose_error(pose, rigid(), BOX, model) for pose in (None, rigid(), rigid(), None)]
     relative, degrees, metres = (
         np.array([getattr(one, name) for one in errors])
         for name in ("relative", "rotation_deg", "translation")
@@ -193,12 +184,7 @@ def test_no_pose_is_infinitely_wrong_and_counts_as_failure(model):
     assert within_deg_cm(degrees, metres, 180).tolist() == [False, True, True, False]
 
 
-def test_every_pose_has_its_truth():
-    with pytest.raises(ValueError, match="zip"):
-        errors_of_poses([rigid(), rigid()], [rigid()], BOX)
-
-
-def test_add_counts_what_is_below_the_fraction_and_not_what_is_equal():
+def test_add_counts_errors_strictly_below_the_fraction():
     errors = np.array([0.0, 0.0199, 0.02, 0.05, 0.0999, 0.1, 3.0, np.inf])
     assert [add_percent(errors, fraction) for fraction in (0.02, 0.05, 0.1)] == [25.0, 37.5, 62.5]
 
@@ -214,12 +200,12 @@ def test_add_counts_what_is_below_the_fraction_and_not_what_is_equal():
         (3.0, 0.002, 0.0),
     ],
 )
-def test_degrees_and_centimetres_must_both_be_within(deg, metres, expected):
+def test_degrees_and_centimeters_must_both_be_within(deg, metres, expected):
     assert deg_cm_percent(np.array([deg]), np.array([metres]), 1) == expected
 
 
 @pytest.mark.parametrize("n", [1, 3, 5])
-def test_translations_are_metres_and_the_boundary_of_n_degrees_n_centimetres_is_within(n):
+def test_translations_are_in_meters_and_the_boundary_of_n_degrees_n_centimeters_is_within(n):
     degrees = np.array([float(n)])
     assert deg_cm_percent(degrees, np.array([n / 100]), n) == 100.0
     assert deg_cm_percent(degrees, np.array([n / 100 + 1e-6]), n) == 0.0
@@ -227,14 +213,14 @@ def test_translations_are_metres_and_the_boundary_of_n_degrees_n_centimetres_is_
 
 
 def test_only_sure_poses_count_as_wrong_when_sure():
-    """Over 0.9 is sure; a tenth of the diagonal is wrong; no confidence is not sure."""
+    """A confidence above 0.9 is sure; an error of a tenth of the diagonal is wrong; NaN is not sure."""
     errors = np.array([0.01, 0.1, 0.5, 0.5, np.inf])
     confidence = np.array([0.95, 0.99, 0.9, 0.2, np.nan])
     assert wrong_when_sure(errors, confidence, 0.1) == 0.5
     assert wrong_when_sure(errors[2:], confidence[2:], 0.1) is None
 
 
-def test_errors_cannot_be_changed():
+def test_errors_are_immutable():
     with pytest.raises(AttributeError):
         NO_POSE.rotation_deg = 0.0  # pyright: ignore[reportAttributeAccessIssue]
     assert replace(NO_POSE, rotation_deg=0.0).rotation_deg == 0.0

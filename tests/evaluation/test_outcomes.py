@@ -7,7 +7,8 @@ from handmade import outcomes_like, rigid
 
 from scenes import BOX
 from slimsfm.datasets.base import ObjectModel
-from slimsfm.evaluation.outcomes import join, outcomes_of
+from slimsfm.evaluation.protocol import outcomes_of
+from slimsfm.evaluation.results import join_outcomes
 from slimsfm.localization import Localization, Seconds
 from slimsfm.pose import PoseEstimate
 
@@ -25,7 +26,7 @@ def localization(pose=None, *, confidence=None, references=3, seconds=(0.01, 0.0
     )
 
 
-def test_entry_i_of_everything_is_of_query_i():
+def test_entry_i_of_each_field_belongs_to_query_i():
     shift = rigid(translation=(0, 0, 0.1))
     found = [
         localization(shift, confidence=0.75, references=7, seconds=(1.0, 2.0, 3.0)),
@@ -38,13 +39,13 @@ def test_entry_i_of_everything_is_of_query_i():
     assert outcomes.rotation_deg.tolist() == [0.0, np.inf, 0.0]
     assert outcomes.translation == pytest.approx([0.1, np.inf, 0.0])
     assert outcomes.confidence[0] == 0.75
-    assert np.isnan(outcomes.confidence[1:]).all()  # no pose, and none that anybody verified
+    assert np.isnan(outcomes.confidence[1:]).all()  # no pose, or no confidence
     assert outcomes.references.tolist() == [7, 0, 2]
     assert outcomes.seconds.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
     assert [pose is None for pose in outcomes.cam_from_world] == [False, True, False]
 
 
-def test_where_there_is_a_model_its_vertices_are_measured():
+def test_errors_use_the_vertices_of_a_model():
     half_a_turn = rigid(angle_deg=180.0)
     pair = ObjectModel(vertices=np.array([[1.0, 0, 0], [-1.0, 0, 0]]), diameter=2.0, symmetric=True)
     outcomes = outcomes_of([localization(half_a_turn)], [rigid()], BOX, pair)
@@ -52,22 +53,24 @@ def test_where_there_is_a_model_its_vertices_are_measured():
     assert outcomes.rotation_deg == pytest.approx([180])
 
 
-def test_there_must_be_queries_each_with_its_truth():
+def test_there_must_be_queries_each_with_a_true_pose():
     with pytest.raises(ValueError, match="at least one query"):
         outcomes_of([], [], BOX)
     with pytest.raises(ValueError, match="zip"):
         outcomes_of([localization()], [], BOX)
+    with pytest.raises(ValueError, match="zip"):
+        outcomes_of([localization(rigid()), localization(rigid())], [rigid()], BOX)
 
 
-def test_every_field_is_of_as_many_queries():
+def test_all_fields_have_the_same_length():
     two = outcomes_like([0.1, 0.2])
-    with pytest.raises(ValueError, match="as many queries"):
+    with pytest.raises(ValueError, match="the same number of queries"):
         replace(two, cam_from_world=two.cam_from_world[:1])
 
 
-def test_joined_outcomes_stand_one_after_the_other():
+def test_joined_outcomes_are_concatenated():
     first, second = outcomes_like([0.1, np.inf]), outcomes_like([0.3], references=8)
-    both = join([first, second])
+    both = join_outcomes([first, second])
     assert both.error.tolist() == [0.1, np.inf, 0.3]
     assert both.references.tolist() == [3, 3, 8]
     assert both.seconds.shape == (3, 3)

@@ -3,11 +3,11 @@ import pytest
 
 from scenes import camera, exact_map
 from slimsfm.evaluation.protocol import (
+    PosedQuery,
     PreparedQuery,
-    Query,
     evaluate,
     localize_all,
-    prepare,
+    prepare_queries,
     queries_of,
 )
 from strategies import CLASSICAL
@@ -20,10 +20,10 @@ def narrow():
 
 @pytest.fixture
 def queries(narrow, tmp_path):
-    """The references themselves, whose features are known and so need no file."""
+    """The references as queries; their features are known, so no file is needed."""
     return [
         PreparedQuery(
-            query=Query(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
+            query=PosedQuery(path=tmp_path / name, camera=camera(), cam_from_world=image.cam_from_world()),
             features=narrow.features[name],
             extract_seconds=0.25,
         )
@@ -40,13 +40,13 @@ def test_outcomes_come_in_the_order_of_the_queries(narrow, queries, strategy):
 
 
 @pytest.mark.parametrize("strategy", CLASSICAL)
-def test_no_query_is_refused(narrow, strategy):
+def test_no_query_is_an_error(narrow, strategy):
     with pytest.raises(ValueError, match="queries must hold at least one"):
         localize_all(narrow, [], strategy)
 
 
 def test_queries_that_cannot_be_localized_stay_in_their_place(narrow, queries):
-    """Of a query that sees nothing of the map nothing is found, and the others do not mind."""
+    """A query without any match to the map fails, and the others are not affected."""
     rng = np.random.default_rng(0)
     lost = queries[3].features
     strange = rng.normal(size=lost.descriptors.shape).astype(np.float32)
@@ -65,9 +65,9 @@ def test_queries_that_cannot_be_localized_stay_in_their_place(narrow, queries):
     assert [pose is None for pose in outcomes.cam_from_world].index(True) == 3
 
 
-def test_preparing_extracts_what_the_maps_extractor_finds(boulder):
+def test_preparing_uses_the_extractor_of_the_map(boulder):
     map_, queries = boulder.map, queries_of(boulder.mapping)[:3]
-    for query, prepared in zip(queries, prepare(map_, queries), strict=True):
+    for query, prepared in zip(queries, prepare_queries(map_, queries), strict=True):
         stored = map_.features[query.path.name]
         assert (prepared.features.keypoints == stored.keypoints).all()
         assert (prepared.features.descriptors == stored.descriptors).all()

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from handmade import FULL, cell_like, random_pose, result_like, run_like
+from handmade import FULL, measurement_like, random_pose, result_like, run_like
 
 from scenes import camera
 from slimsfm.errors import InputError
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.protocol import Query
+from slimsfm.evaluation.protocol import PosedQuery
 from slimsfm.evaluation.result_files import (
     digest_of,
     object_to_json,
@@ -18,7 +17,7 @@ from slimsfm.evaluation.result_files import (
     run_to_json,
     write_json,
 )
-from slimsfm.evaluation.results import Cell, Trial
+from slimsfm.evaluation.results import MapRun, Measurement, Outcomes
 from slimsfm.geometry import Box
 
 QUERIES = 20
@@ -39,23 +38,25 @@ def random_outcomes(rng):
 
 @pytest.fixture
 def run(tmp_path):
-    """A run whose numbers have all their digits."""
+    """A run with random numbers of full precision."""
     rng = np.random.default_rng(0)
     draws = tuple(
-        Trial(references=3, points=17, map_bytes=4711, outcomes=random_outcomes(rng)) for _ in range(2)
+        MapRun(references=3, points=17, map_bytes=4711, outcomes=random_outcomes(rng)) for _ in range(2)
     )
     objects = [
         replace(
-            result_like(name, cell_like(FULL, [0.0] * QUERIES)),
+            result_like(name, measurement_like(FULL, [0.0] * QUERIES)),
             box=Box(rng.normal(size=3), rng.normal(size=(3, 3))),
             unit=unit,
             queries=tuple(
-                Query(path=Path("photos", f"{i}.png"), camera=camera(model), cam_from_world=random_pose(rng))
+                PosedQuery(
+                    path=Path("photos", f"{i}.png"), camera=camera(model), cam_from_world=random_pose(rng)
+                )
                 for i in range(QUERIES)
             ),
-            cells=(
-                Cell(method="sift", strategy="direct", variant="full", trials=draws[:1]),
-                Cell(method="sift", strategy="direct", variant="random:3", trials=draws),
+            measurements=(
+                Measurement(method="sift", strategy="direct", variant="full", map_runs=draws[:1]),
+                Measurement(method="sift", strategy="direct", variant="random:3", map_runs=draws),
             ),
         )
         for name, unit, model in (("can", "metre", "OPENCV"), ("mug", "unknown", "SIMPLE_RADIAL"))
@@ -73,14 +74,14 @@ def same_bits(a, b):
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
-def test_what_is_read_is_to_the_bit_what_was_written(run, written):
+def test_reading_returns_the_written_values_bit_for_bit(run, written):
     found = read_run(written.parent)
     assert digest_of(found.objects) == digest_of(run.objects)
     assert run_to_json(found) == run_to_json(run)
     for was, now in zip(run.objects, found.objects, strict=True):
         assert same_bits(was.box.half_edges, now.box.half_edges)
-        for cell_was, cell_now in zip(was.cells, now.cells, strict=True):
-            for one, other in zip(cell_was.trials, cell_now.trials, strict=True):
+        for cell_was, cell_now in zip(was.measurements, now.measurements, strict=True):
+            for one, other in zip(cell_was.map_runs, cell_now.map_runs, strict=True):
                 assert_equal_outcomes(one.outcomes, other.outcomes)
 
 
@@ -94,8 +95,8 @@ def assert_equal_outcomes(a, b):
             assert same_bits(one.translation, other.translation)
 
 
-def test_everything_else_comes_back_too(run, written):
-    found = read_run(written)  # the file does as well as its folder
+def test_reading_returns_all_other_fields(run, written):
+    found = read_run(written)  # the file works as well as its folder
     assert found.folder == run.folder
     for name in ("dataset", "options", "environment", "failed"):
         assert getattr(found, name) == getattr(run, name)
@@ -113,19 +114,19 @@ def test_the_file_is_strict_json_in_which_no_pose_is_null(run, written):
         raise AssertionError(constant)
 
     data = json.loads(written.read_text(), parse_constant=refuse)
-    trial, outcomes = data["objects"][0]["cells"][0]["trials"][0], run.objects[0].cells[0].outcomes
+    trial, outcomes = data["objects"][0]["cells"][0]["trials"][0], run.objects[0].measurements[0].outcomes
     for key in ("error", "rotation_deg", "translation", "cam_from_world"):
         assert [value is None for value in trial[key]] == [one is None for one in outcomes.cam_from_world]
     assert [value is None for value in trial["confidence"]] == np.isnan(outcomes.confidence).tolist()
 
 
-def test_the_digest_is_of_poses_and_maps_alone(run):
+def test_the_digest_depends_only_on_poses_and_maps(run):
     (can, mug), before = run.objects, digest_of(run.objects)
 
     def changed(**fields):
         return digest_of([with_outcomes(can, **fields), mug])
 
-    outcomes = can.cells[0].outcomes
+    outcomes = can.measurements[0].outcomes
     assert changed(seconds=7 * outcomes.seconds) == before
     moved = replace(can, images=Path("elsewhere"))
     assert digest_of([moved, mug]) == before
@@ -138,17 +139,17 @@ def test_the_digest_is_of_poses_and_maps_alone(run):
 
 
 def with_outcomes(result, **fields):
-    cell = result.cells[0]
-    trial = replace(cell.trials[0], outcomes=replace(cell.outcomes, **fields))
-    return replace(result, cells=(replace(cell, trials=(trial,)), *result.cells[1:]))
+    cell = result.measurements[0]
+    trial = replace(cell.map_runs[0], outcomes=replace(cell.outcomes, **fields))
+    return replace(result, measurements=(replace(cell, map_runs=(trial,)), *result.measurements[1:]))
 
 
-def test_a_single_object_comes_back_too(run, tmp_path):
+def test_a_single_object_can_be_read(run, tmp_path):
     write_json(tmp_path / "can.json", object_to_json(run.objects[0]))
     assert digest_of([read_object_result(tmp_path / "can.json")]) == digest_of(run.objects[:1])
 
 
-def test_infinite_numbers_are_refused_and_what_stood_there_stays(tmp_path):
+def test_infinite_numbers_are_an_error_and_the_old_file_stays(tmp_path):
     write_json(tmp_path / "x.json", {"a": 1.0})
     with pytest.raises(ValueError, match="JSON"):
         write_json(tmp_path / "x.json", {"a": np.inf})
@@ -206,25 +207,25 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
-def test_damaged_results_are_named(written, damage):
+def test_damaged_results_are_named_in_the_error(written, damage):
     written.write_text(damage(written.read_text()))
-    with pytest.raises(InputError, match=r"results\.json: is no result of slimsfm benchmark \(.*; run"):
+    with pytest.raises(InputError, match=r"results\.json: not a result of slimsfm benchmark \(.*; run"):
         read_run(written.parent)
 
 
-def test_results_that_are_no_text_are_named(written):
+def test_binary_results_are_named_in_the_error(written):
     written.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match=r"results\.json: is no result"):
+    with pytest.raises(InputError, match=r"results\.json: not a result"):
         read_run(written)
 
 
-def test_results_of_another_format_are_named(written):
+def test_results_of_another_format_are_named_in_the_error(written):
     written.write_text(put(2, "format")(written.read_text()))
-    with pytest.raises(InputError, match=r"results\.json: is of format 2, this reads 1; run it again"):
+    with pytest.raises(InputError, match=r"results\.json: has format 2, expected 1; run the benchmark again"):
         read_run(written)
 
 
-def test_missing_results_are_named(tmp_path):
+def test_missing_results_are_named_in_the_error(tmp_path):
     for given in (tmp_path, tmp_path / "nothing", tmp_path / "nothing.json"):
-        with pytest.raises(InputError, match="no such file; give the folder of a run of slimsfm benchmark"):
+        with pytest.raises(InputError, match="no such file; pass the folder of a run of slimsfm benchmark"):
             read_run(given)

@@ -5,14 +5,12 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 
-import tiny_dataset
 from commands import contents
 from slimsfm.errors import InputError, OutputError
-from slimsfm.evaluation.benchmark import Bench
+from slimsfm.evaluation.benchmark import BenchmarkSetup
 from slimsfm.evaluation.result_files import digest_of, object_to_json, read_object_result
 from slimsfm.evaluation.run import object_path, run_benchmark
 from slimsfm.execution import processes
@@ -25,7 +23,7 @@ SPANS = {"can": range(2, 10), "mug": range(14, 22)}
 
 
 def write_object(root, name, boulder):
-    """Eight neighbouring frames of the rendered object, two of them queries."""
+    """Eight neighboring frames of the rendered object, two of them queries."""
     images = [f"{number}.png" for number in SPANS[name]]
     queries = [images[2], images[5]]
     add_object(root, name, boulder.map, boulder.photos, queries, [x for x in images if x not in queries])
@@ -41,19 +39,19 @@ def dataset(boulder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(dataset, tmp_path_factory):
-    """A run that nothing interrupted."""
+    """A run without interruption."""
     return run_benchmark(dataset, bench_in(tmp_path_factory.mktemp("whole") / "run"))
 
 
 @pytest.fixture
 def breakable(dataset, tmp_path):
-    """The data set at a place of its own, where its objects may be broken."""
+    """A copy of the data set, whose objects may be broken."""
     shutil.copytree(dataset.path, tmp_path / "data")
     return TinyDataset(path=tmp_path / "data")
 
 
 def bench_in(folder, **how):
-    return Bench(folder=folder, options=OPTIONS, **how)
+    return BenchmarkSetup(folder=folder, options=OPTIONS, **how)
 
 
 def break_object(dataset, name, how):
@@ -66,7 +64,7 @@ def mend(dataset, name):
 
 
 def without_time(path):
-    """The result of an object but for times; what differs is then what was found."""
+    """The result of an object without times."""
 
     def strip(value):
         if isinstance(value, dict):
@@ -77,7 +75,7 @@ def without_time(path):
 
 
 def state_of(folder, name):
-    """All that a run keeps of an object, and when it was written."""
+    """The files of an object in a run, and their modification times."""
     maps = folder / "maps" / name
     paths = [object_path(folder, name), *sorted(maps.rglob("*"))]
     return contents(maps), object_path(folder, name).read_bytes(), [one.stat().st_mtime_ns for one in paths]
@@ -98,7 +96,7 @@ def assert_nothing_half_written(folder):
     assert [name for name in names if name.endswith((".partial", ".old"))] == []
 
 
-def test_a_run_measures_every_object_and_keeps_what_it_found(whole, dataset):
+def test_a_run_measures_every_object_and_stores_the_results(whole, dataset):
     assert whole.dataset == f"TinyDataset {dataset.path.name}"
     assert [one.name for one in whole.objects] == NAMES
     assert sorted(path.name for path in whole.folder.iterdir()) == ["maps", "objects", "run.json"]
@@ -111,7 +109,7 @@ def test_a_run_measures_every_object_and_keeps_what_it_found(whole, dataset):
     assert_nothing_half_written(whole.folder)
 
 
-def test_a_run_tells_what_was_asked_for_and_on_what_it_was_measured(whole):
+def test_a_run_stores_its_options_and_environment(whole):
     assert whole.options["variants"] == OPTIONS.variants
     assert whole.options["build"]["extractor"] == "sift"
     assert {"slimsfm", "numpy", "pycolmap", "python", "system", "cpu", "cores", "gpu"} <= set(
@@ -131,7 +129,7 @@ def interrupted():
     raise KeyboardInterrupt
 
 
-def test_a_run_that_is_interrupted_again_and_again_finds_the_same(whole, breakable, tmp_path):
+def test_a_run_that_is_interrupted_repeatedly_has_the_same_result(whole, breakable, tmp_path):
     """While it reads its second object, computes the graph, and chooses points."""
     folder = tmp_path / "run"
     break_object(breakable, "mug", "interrupt")
@@ -148,12 +146,12 @@ def test_a_run_that_is_interrupted_again_and_again_finds_the_same(whole, breakab
     assert_equal_runs(run, whole)
 
 
-def test_a_run_whose_process_was_killed_goes_on_and_finds_the_same(whole, dataset, tmp_path):
-    """SIGKILL leaves no time to clean up: what lay half-written is written anew."""
+def test_a_run_continues_after_its_process_was_killed(whole, dataset, tmp_path):
+    """SIGKILL leaves no time to clean up: partial files are written again."""
     folder = tmp_path / "run"
     killed = subprocess.run(
         [sys.executable, "-m", "tiny_dataset", dataset.path, folder, "find usable points", "2"],
-        env={**os.environ, "PYTHONPATH": str(Path(tiny_dataset.__file__).parent), "TMPDIR": str(tmp_path)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)},
         check=False,
         capture_output=True,
     )
@@ -168,7 +166,7 @@ def test_a_run_whose_process_was_killed_goes_on_and_finds_the_same(whole, datase
     assert_equal_runs(run, whole)
 
 
-def test_broken_objects_hold_up_no_other_and_are_tried_again(whole, breakable, tmp_path):
+def test_broken_objects_do_not_stop_others_and_are_tried_again(whole, breakable, tmp_path):
     folder = tmp_path / "run"
     break_object(breakable, "can", "input")
     break_object(breakable, "jar", "bug")
@@ -185,16 +183,16 @@ def test_broken_objects_hold_up_no_other_and_are_tried_again(whole, breakable, t
     assert state_of(folder, "mug") == done
 
 
-def test_what_failed_is_told_to_the_log_unless_its_reader_can_mend_it(breakable, tmp_path, caplog):
+def test_unexpected_failures_are_logged(breakable, tmp_path, caplog):
     break_object(breakable, "can", "input")
     break_object(breakable, "mug", "bug")
     run_benchmark(breakable, bench_in(tmp_path / "run"))
     (record,) = caplog.records
-    assert record.getMessage() == "mug could not be measured"
+    assert record.getMessage() == "mug failed"
     assert record.exc_info[1].args == ("it is broken",)
 
 
-def test_a_run_in_which_everything_failed_leaves_nothing(breakable, tmp_path):
+def test_a_run_in_which_everything_failed_leaves_no_files(breakable, tmp_path):
     for name in NAMES:
         break_object(breakable, name, "input")
     run = run_benchmark(breakable, bench_in(tmp_path / "run"))
@@ -203,7 +201,7 @@ def test_a_run_in_which_everything_failed_leaves_nothing(breakable, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_two_processes_find_what_one_finds(whole, breakable, tmp_path):
+def test_two_processes_give_the_result_of_one(whole, breakable, tmp_path):
     break_object(breakable, "jar", "bug")
     shown = []
 
@@ -218,17 +216,17 @@ def test_two_processes_find_what_one_finds(whole, breakable, tmp_path):
     assert_equal_runs(replace(run, failed={}), whole)
 
 
-def test_a_folder_of_other_options_is_refused_until_it_may_be_overwritten(whole, dataset, tmp_path):
+def test_a_run_with_other_options_is_kept_unless_overwrite_is_on(whole, dataset, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(whole.folder, folder)
     before = contents(folder)
     options = replace(OPTIONS, strategies=("direct",), variants=("full",))
-    bench = Bench(folder=folder, options=options)
-    with pytest.raises(OutputError, match=r"run: holds a run of other options; choose .* --overwrite"):
+    bench = BenchmarkSetup(folder=folder, options=options)
+    with pytest.raises(OutputError, match=r"run: holds a run with other options; choose .* set overwrite"):
         run_benchmark(dataset, bench)
     assert contents(folder) == before
     run = run_benchmark(dataset, bench, overwrite=True)
-    assert [cell.key for one in run.objects for cell in one.cells] == [("sift", "direct", "full")] * 2
+    assert [cell.key for one in run.objects for cell in one.measurements] == [("sift", "direct", "full")] * 2
     assert {path.name for path in (folder / "maps" / "can" / "sift").iterdir()} == {"full"}
 
 
@@ -238,29 +236,29 @@ def test_another_data_set_and_another_build_are_other_options(whole, dataset, br
         (breakable, bench),
         (dataset, replace(bench, build=replace(bench.build, max_features=100))),
     ):
-        with pytest.raises(OutputError, match="a run of other options"):
+        with pytest.raises(OutputError, match="a run with other options"):
             run_benchmark(other, how)
 
 
-def test_a_run_of_the_same_options_goes_on_even_if_it_may_be_overwritten(whole, dataset):
+def test_overwrite_continues_a_run_with_the_same_options(whole, dataset):
     before = [state_of(whole.folder, name) for name in NAMES]
     run_benchmark(dataset, bench_in(whole.folder), overwrite=True)
     assert [state_of(whole.folder, name) for name in NAMES] == before
 
 
 @pytest.mark.parametrize("content", ["notes.txt", "run.json"])
-def test_a_folder_of_something_else_is_refused(dataset, tmp_path, content):
+def test_a_folder_with_other_files_is_an_error(dataset, tmp_path, content):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / content).write_text("mine")
-    for overwrite in (False, True):  # what is no run is nobody's to delete
-        with pytest.raises(OutputError, match="exists already and is no run"):
+    for overwrite in (False, True):  # other files are never deleted
+        with pytest.raises(OutputError, match="exists already and is not a run"):
             run_benchmark(dataset, bench_in(tmp_path / "run"), overwrite=overwrite)
     assert contents(tmp_path / "run") == {content: b"mine"}
 
 
-def test_a_file_is_refused(dataset, tmp_path):
+def test_a_file_as_folder_is_an_error(dataset, tmp_path):
     (tmp_path / "run").write_text("mine")
-    with pytest.raises(OutputError, match="exists already and is no run"):
+    with pytest.raises(OutputError, match="exists already and is not a run"):
         run_benchmark(dataset, bench_in(tmp_path / "run"))
     assert (tmp_path / "run").read_text() == "mine"
 
@@ -272,25 +270,25 @@ def test_a_data_set_without_objects_leaves_no_folder(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_damaged_result_of_an_object_is_named(whole, dataset, tmp_path):
+def test_a_damaged_result_of_an_object_is_named_in_the_error(whole, dataset, tmp_path):
     shutil.copytree(whole.folder, tmp_path / "run")
     path = object_path(tmp_path / "run", "mug")
     path.write_text(path.read_text()[:1000])
-    with pytest.raises(InputError, match=r"mug\.json: is no result of slimsfm benchmark .*delete it"):
+    with pytest.raises(InputError, match=r"mug\.json: not a result of slimsfm benchmark .*delete it"):
         run_benchmark(dataset, bench_in(tmp_path / "run"))
 
 
-def test_what_a_killed_process_left_in_the_folder_is_in_nobodys_way(dataset, tmp_path):
+def test_leftovers_of_a_killed_process_are_ignored(dataset, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".run.json.partial").write_text("half")
     options = replace(OPTIONS, strategies=("direct",), variants=("full",))
-    assert not run_benchmark(dataset, Bench(folder=tmp_path / "run", options=options)).failed
+    assert not run_benchmark(dataset, BenchmarkSetup(folder=tmp_path / "run", options=options)).failed
 
 
 def test_maps_of_an_object_that_failed_are_not_used_again(breakable, tmp_path):
     told = breakable.path / NAMES[0] / "object.json"
     gone = json.loads(told.read_text()) | {"photos": "nowhere"}
-    told.write_text(json.dumps(gone))  # found out when the object is mapped already
+    told.write_text(json.dumps(gone))  # detected only after mapping
     bench = bench_in(tmp_path / "run")
     assert "nowhere" in run_benchmark(breakable, bench).failed[NAMES[0]]
     assert [path.name for path in (bench.folder / "maps").iterdir()] == [NAMES[1]]

@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 from handmade import outcomes_like
 
-from slimsfm.evaluation.outcomes import join
-from slimsfm.evaluation.scores import mean_scores, score, shares
+from slimsfm.evaluation.results import join_outcomes
+from slimsfm.evaluation.scores import criteria, mean_scores, score
 
 
 def test_scores_sum_up_mixed_outcomes():
-    """Errors as relative, hundredfold as degrees, and as metres."""
+    """Relative errors, also as meters, and times 100 as degrees."""
     quick, slow = (0.01, 0.02, 0.005), (0.06, 0.12, 0.005)
     found = [outcomes_like([0.005, 0.03, 0.2, np.inf], seconds=quick), outcomes_like([np.inf], seconds=slow)]
-    scores = score(join(found), metric=True)
+    scores = score(join_outcomes(found), metric=True)
     assert scores.queries == 5
     assert scores.localized == 60.0
     assert scores.add == {0.1: 40.0, 0.05: 40.0, 0.02: 20.0}
@@ -24,16 +24,16 @@ def test_scores_sum_up_mixed_outcomes():
     assert scores.fps == pytest.approx(1 / 0.065)
 
 
-def test_queries_of_several_trials_are_counted_once():
+def test_queries_of_several_draws_are_counted_once():
     outcomes = outcomes_like([0.01, 0.01, np.inf, 0.01])
-    assert score(outcomes, metric=True, trials=2).queries == 2
-    assert score(outcomes, metric=True, trials=2).localized == 75.0
+    assert score(outcomes, metric=True, draws=2).queries == 2
+    assert score(outcomes, metric=True, draws=2).localized == 75.0
 
 
-def test_without_a_metric_unit_there_are_no_centimetres():
+def test_without_a_metric_unit_there_are_no_centimeters():
     scores = score(outcomes_like([0.0]), metric=False)
     assert scores.deg_cm is None
-    assert set(shares(metric=False)) == {"localized", "add_0.1d", "add_0.05d", "add_0.02d"}
+    assert set(criteria(metric=False)) == {"localized", "add_0.1d", "add_0.05d", "add_0.02d"}
 
 
 def test_the_median_is_infinite_unless_more_than_half_are_localized():
@@ -42,7 +42,7 @@ def test_the_median_is_infinite_unless_more_than_half_are_localized():
     assert most.median_error == pytest.approx(0.03)
 
 
-def test_where_nothing_is_localized_everything_is_a_failure_and_nobody_was_sure():
+def test_without_any_pose_everything_fails_and_no_pose_is_sure():
     scores = score(outcomes_like([np.inf, np.inf]), metric=True)
     assert scores.localized == 0.0
     assert scores.add == {0.1: 0.0, 0.05: 0.0, 0.02: 0.0}
@@ -50,10 +50,10 @@ def test_where_nothing_is_localized_everything_is_a_failure_and_nobody_was_sure(
     assert scores.confidence_wrong is None
 
 
-def test_the_shares_are_the_percentages_query_by_query():
+def test_the_criteria_give_the_percentages_query_by_query():
     outcomes = outcomes_like([0.005, 0.02, 0.03, 0.05, 0.07, 0.1, np.inf])
     scores = score(outcomes, metric=True)
-    percent = {name: 100 * fulfil(outcomes).mean() for name, fulfil in shares(metric=True).items()}
+    percent = {name: 100 * fulfil(outcomes).mean() for name, fulfil in criteria(metric=True).items()}
     assert percent == {
         "localized": scores.localized,
         **{f"add_{fraction}d": value for fraction, value in scores.add.items()},
@@ -61,12 +61,12 @@ def test_the_shares_are_the_percentages_query_by_query():
     }
 
 
-def test_the_mean_of_one_is_that_one():
+def test_the_mean_of_one_object_is_its_score():
     one = score(outcomes_like([0.01, 0.04, np.inf]), metric=True)
     assert mean_scores([one]) == one
 
 
-def test_means_count_every_object_alike_and_take_the_median_of_medians():
+def test_means_weigh_objects_equally_and_use_the_median_of_medians():
     scores = [
         score(outcomes_like([0.01] * 4, seconds=(0.01, 0.02, 0.01)), metric=True),
         score(outcomes_like([0.03], seconds=(0.01, 0.05, 0.01), references=6), metric=True),
@@ -78,16 +78,16 @@ def test_means_count_every_object_alike_and_take_the_median_of_medians():
     assert mean.add == pytest.approx({0.1: 200 / 3, 0.05: 200 / 3, 0.02: 100 / 3})
     assert mean.deg_cm == pytest.approx({1: 100 / 3, 3: 200 / 3, 5: 200 / 3})
     assert mean.median_error == pytest.approx(0.03)
-    assert mean.confidence_wrong == 0.0  # of the two that have poses to be sure of
+    assert mean.confidence_wrong == 0.0  # over the two that have sure poses
     assert mean.references_tried == 4.0
     assert mean.seconds.match == pytest.approx(0.05)
     assert mean.fps == pytest.approx(1 / 0.07)
 
 
-def test_one_without_centimetres_leaves_the_mean_without():
+def test_one_object_of_unknown_unit_removes_centimeters_from_the_mean():
     known, unknown = (score(outcomes_like([0.01]), metric=metric) for metric in (True, False))
     assert mean_scores([known, unknown]).deg_cm is None
 
 
-def test_a_mean_over_nobody_sure_has_no_share_of_wrong_ones():
+def test_a_mean_without_sure_poses_has_no_share_of_wrong_ones():
     assert mean_scores([score(outcomes_like([np.inf]), metric=True)] * 2).confidence_wrong is None

@@ -2,16 +2,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from slimsfm.evaluation.statistics import bootstrap, paired_p_value
+from slimsfm.evaluation.scores import bootstrap, paired_p_value
 
 
 def means(found):
-    """The figures are the means themselves, of the one group there is."""
+    """The figures are the means of the only group."""
     return found[:, 0, :]
 
 
 def test_intervals_agree_with_scipy_on_skewed_values():
-    """Both are by chance: at 9999 draws an end is known to about 3 % of the mean's standard error."""
+    """Both are random: with 9999 draws an end has an error of about 3 % of the standard error of the mean."""
     rng = np.random.default_rng(3)
     for n in (10, 60, 300):
         values = rng.lognormal(sigma=1.2, size=n)
@@ -25,8 +25,8 @@ def test_intervals_agree_with_scipy_on_skewed_values():
         assert values.mean() - ours.low < ours.high - values.mean()  # skewed as the values are
 
 
-def test_each_group_is_drawn_by_itself():
-    """Two objects of one sure outcome each: drawn together they would get mixed, here nothing varies."""
+def test_each_group_is_resampled_on_its_own():
+    """Two objects with constant outcomes: resampled together they would mix, here nothing varies."""
     groups = [np.zeros((5, 1)), np.full((9, 1), 100.0)]
     (interval,) = bootstrap(groups, lambda found: found.mean(axis=1))
     assert interval.low == interval.high == 50.0
@@ -41,8 +41,8 @@ def test_the_variance_of_a_mean_over_groups_is_that_of_their_means():
 
 
 @pytest.mark.parametrize("draw", ["normal", "uniform", "exponential"])
-def test_about_95_percent_of_intervals_hold_the_truth(draw):
-    """Every column is one study of 60 queries; of skewed values the intervals are a little too short."""
+def test_about_95_percent_of_intervals_contain_the_true_mean(draw):
+    """Every column is one study of 60 queries; for skewed values the intervals are slightly too short."""
     rng = np.random.default_rng(5)
     sample, truth = {
         "normal": (rng.normal(2.0, 1.0, (60, 400)), 2.0),
@@ -53,13 +53,13 @@ def test_about_95_percent_of_intervals_hold_the_truth(draw):
     assert 0.90 <= np.mean([one.low <= truth <= one.high for one in found]) <= 0.98
 
 
-def test_about_95_percent_of_intervals_hold_the_true_percentage():
+def test_about_95_percent_of_intervals_contain_the_true_percentage():
     sample = 100.0 * (np.random.default_rng(6).random((100, 400)) < 0.8)
     found = bootstrap([sample], means)
     assert 0.90 <= np.mean([one.low <= 80 <= one.high for one in found]) <= 0.98
 
 
-def test_equal_values_leave_no_doubt():
+def test_equal_values_have_an_interval_of_zero_width():
     (interval,) = bootstrap([np.full((7, 1), 100.0)], means)
     assert interval.low == interval.high == 100.0
     (interval,) = bootstrap([np.full((7, 1), 0.1)], means)
@@ -77,8 +77,8 @@ def test_equal_values_give_equal_intervals_and_the_order_of_figures_is_kept():
 
 
 @pytest.mark.parametrize("lost", range(14))
-def test_of_zeros_and_ones_the_test_is_mcnemars(lost):
-    """Only queries that differ count, and of these each side is as probable as the other."""
+def test_for_zeros_and_ones_the_test_is_mcnemars(lost):
+    """Only differing queries count, and both signs are equally probable."""
     for won in range(14 - lost):
         a = np.array([1.0] * lost + [0.0] * won + [1.0, 0.0, 0.0])
         b = np.array([0.0] * lost + [1.0] * won + [1.0, 0.0, 0.0])
@@ -87,13 +87,13 @@ def test_of_zeros_and_ones_the_test_is_mcnemars(lost):
 
 
 @pytest.mark.parametrize(("lost", "won"), [(10, 10), (8, 16), (20, 40)])
-def test_with_many_queries_mcnemars_is_met_by_chance(lost, won):
+def test_with_many_queries_the_test_approximates_mcnemars(lost, won):
     a, b = np.repeat([1.0, 0.0], [lost, won]), np.repeat([0.0, 1.0], [lost, won])
     expected = stats.binomtest(lost, lost + won).pvalue
     assert paired_p_value(a, b) == pytest.approx(expected, abs=0.02)
 
 
-def test_it_does_not_matter_which_comes_first():
+def test_the_p_value_is_symmetric():
     rng = np.random.default_rng(8)
     for n in (2, 7, 13, 14, 50):
         a, b = rng.random(n), rng.random(n)
@@ -107,20 +107,20 @@ def test_equal_values_do_not_differ():
 
 
 def test_means_over_draws_that_cancel_out_do_not_differ():
-    """Fifths, as means over five draws are, whose sum is 0 but for rounding."""
+    """Means over five draws are fifths; their sum is 0 up to rounding."""
     a, b = np.array([0.6, 0.2, 0.8, 0.0]), np.array([0.0, 0.8, 0.2, 0.6])
     assert paired_p_value(a, b) == 1.0
     assert paired_p_value(b, a) == 1.0
 
 
-def test_of_equally_good_variants_p_is_uniform():
+def test_for_equally_good_variants_p_is_uniform():
     rng = np.random.default_rng(10)
     found = np.array([paired_p_value(rng.normal(size=7), rng.normal(size=7)) for _ in range(300)])
     for level in (0.05, 0.25, 0.5, 0.75):
         assert np.mean(found <= level) == pytest.approx(level, abs=0.08)
 
 
-def test_more_evidence_is_less_probable_by_chance():
+def test_more_evidence_has_a_smaller_p_value():
     found = [paired_p_value(np.ones(n), np.zeros(n)) for n in range(2, 14)]
     assert found == pytest.approx([2.0 ** (1 - n) for n in range(2, 14)])
     assert paired_p_value(np.ones(100), np.zeros(100)) < 0.001

@@ -1,13 +1,13 @@
 from dataclasses import replace
 
 import pytest
-from handmade import FULL, cell_like, mapped_like, result_like
+from handmade import FULL, mapped_like, measurement_like, result_like
 
-from slimsfm.evaluation.summary import summarize_domination
+from slimsfm.evaluation.comparison import summarize_domination
 
 
-def test_dominating_sets_are_summed_up_by_method():
-    plain = result_like("toy", cell_like(FULL, [0.01]))
+def test_dominating_sets_are_summarized_by_method():
+    plain = result_like("toy", measurement_like(FULL, [0.01]))
     sizes = [(10, 2, 40), (20, 3, 50), (40, 10, 90)]
     objects = [
         replace(
@@ -30,5 +30,5 @@ def test_dominating_sets_are_summed_up_by_method():
     assert aliked.to_json()["points_kept_mean"] == pytest.approx(0.4)
 
 
-def test_without_objects_there_is_nothing_to_sum_up():
+def test_without_objects_there_is_no_summary():
     assert summarize_domination([]) == []

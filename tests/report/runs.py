@@ -9,12 +9,11 @@ import numpy as np
 from PIL import Image
 
 from scenes import exact_map
-from slimsfm.cli.results import report_run
 from slimsfm.evaluation.benchmark import BenchmarkOptions
-from slimsfm.evaluation.outcomes import outcomes_of
-from slimsfm.evaluation.protocol import PreparedQuery, Query, localize_all
-from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Run, Trial
-from slimsfm.evaluation.variants import Making, parse_variant
+from slimsfm.evaluation.protocol import PosedQuery, PreparedQuery, localize_all, outcomes_of
+from slimsfm.evaluation.result_files import write_results
+from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, Run
+from slimsfm.evaluation.variants import VariantInputs, parse_variant
 from slimsfm.geometry import project
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import load_or_compute_graph
@@ -38,7 +37,7 @@ def make_run(folder: Path, objects: Mapping[str, int]) -> Run:
         objects=tuple(_measured(folder, name, count) for name, count in sorted(objects.items())),
         failed={"jug": "there is no photo"},
     )
-    report_run(run)
+    write_results(run)
     return run
 
 
@@ -53,7 +52,9 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
     full = read_map(base / "full")
     graph = load_or_compute_graph(full, base / "full", GraphOptions(edges="localize", candidates="all")).graph
     solution = dominating_set(graph, ReductionOptions(), full)
-    making = Making(map=full, graph=graph, reduction=ReductionOptions(), solution=solution, weigh=weigh_map)
+    making = VariantInputs(
+        map=full, graph=graph, reduction=ReductionOptions(), solution=solution, weigh=weigh_map
+    )
     queries = [_query(truth, photos, one) for one in asked]
     prepared = [_prepared(query, truth, hard=query is queries[-1]) for query in queries]
     stored = {variant: _stored(making, variant, base) for variant in _OPTIONS.variants}
@@ -75,12 +76,12 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
                 dominating_points=len(stored["dominating"][0].point3D_ids),
             ),
         ),
-        cells=tuple(
-            Cell(
+        measurements=tuple(
+            Measurement(
                 method="sift",
                 strategy=strategy,
                 variant=variant,
-                trials=tuple(_trial(one, strategy, prepared) for one in maps),
+                map_runs=tuple(_trial(one, strategy, prepared) for one in maps),
             )
             for strategy in _OPTIONS.strategies
             for variant, maps in stored.items()
@@ -89,27 +90,27 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
     )
 
 
-def _query(truth: Map, photos: Path, name: str) -> Query:
+def _query(truth: Map, photos: Path, name: str) -> PosedQuery:
     cam_from_world = truth.images[name].cam_from_world()
-    return Query(path=photos / name, camera=truth.camera(name), cam_from_world=cam_from_world)
+    return PosedQuery(path=photos / name, camera=truth.camera(name), cam_from_world=cam_from_world)
 
 
-def _prepared(query: Query, truth: Map, *, hard: bool) -> PreparedQuery:
+def _prepared(query: PosedQuery, truth: Map, *, hard: bool) -> PreparedQuery:
     features = truth.features[query.path.name]
     seen = features[np.arange(_HARD)] if hard else features
     return PreparedQuery(query=query, features=seen, extract_seconds=0.01)
 
 
-def _stored(making: Making, variant: str, base: Path) -> list[Map]:
+def _stored(making: VariantInputs, variant: str, base: Path) -> list[Map]:
     maps = parse_variant(variant).make(making)
     if variant in ("dominating", "default"):
         write_map(maps[0], base / variant)
     return maps
 
 
-def _trial(map_: Map, strategy: str, prepared: list[PreparedQuery]) -> Trial:
+def _trial(map_: Map, strategy: str, prepared: list[PreparedQuery]) -> MapRun:
     truth = [one.query.cam_from_world for one in prepared]
-    return Trial(
+    return MapRun(
         references=len(map_.images),
         points=len(map_.point3D_ids),
         map_bytes=weigh_map(map_),

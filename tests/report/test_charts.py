@@ -9,10 +9,9 @@ import pytest
 from matplotlib.colors import to_hex
 from scipy.stats import binomtest
 
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.protocol import Query
-from slimsfm.evaluation.scores import Scores
-from slimsfm.evaluation.statistics import Interval
+from slimsfm.evaluation.protocol import PosedQuery
+from slimsfm.evaluation.results import Outcomes
+from slimsfm.evaluation.scores import Interval, Scores
 from slimsfm.evaluation.table import Row
 from slimsfm.geometry import Box
 from slimsfm.localization import Seconds
@@ -348,7 +347,7 @@ def test_queries_are_judged_by_a_tenth_of_the_diagonal(full, reduced):
     assert verdicts(found) == list(VERDICTS)
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 500.0, 640, 480)
     asked = [
-        Query(path=Path("q.png"), camera=camera, cam_from_world=camera_at(azimuth, 0.0))
+        PosedQuery(path=Path("q.png"), camera=camera, cam_from_world=camera_at(azimuth, 0.0))
         for azimuth in (0, 1, 2)
     ]
     places = query_places(asked, found, found)

@@ -88,8 +88,8 @@ def test_the_top_says_what_was_gained_and_what_that_cost(page):
 
 
 def test_tables_hold_every_line_of_every_object_and_average(page, run):
-    lines = sum(len(one.cells) for one in run.objects) + 2 * len(run.objects[0].cells)
-    known = {cell.key[1:] for one in run.objects for cell in one.cells}
+    lines = sum(len(one.measurements) for one in run.objects) + 2 * len(run.objects[0].measurements)
+    known = {cell.key[1:] for one in run.objects for cell in one.measurements}
     found = [row for row in page.rows if known & set(pairwise(row))]
     assert len(found) == lines
     first = next(row for row in page.rows if row[:2] == ["exhaustive", "full"])
@@ -146,7 +146,9 @@ def test_one_object_needs_no_averages_and_what_is_there_stays_unless_overwriting
 
 def test_methods_are_named_where_there_are_several(alone):
     can = alone.objects[0]
-    twice = replace(can, cells=(*can.cells, *(replace(cell, method="aliked") for cell in can.cells)))
+    twice = replace(
+        can, measurements=(*can.measurements, *(replace(cell, method="aliked") for cell in can.measurements))
+    )
     text = Reader(report_html(replace(alone, objects=(twice,)))).text
     assert "the default map, direct, with sift, is" in text
     assert "Maps and graph are those of sift." in text
@@ -170,7 +172,7 @@ def test_a_run_without_a_map_is_refused(alone):
 
 def test_where_just_the_full_map_was_measured_nothing_is_compared(alone):
     can = alone.objects[0]
-    full = replace(can, cells=tuple(cell for cell in can.cells if cell.variant == "full"))
+    full = replace(can, measurements=tuple(cell for cell in can.measurements if cell.variant == "full"))
     text = Reader(report_html(replace(alone, objects=(full,)))).text
     assert "just the full map was measured" in text
     assert "Where it fails" not in text

@@ -5,11 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from city import CityOptions, city_map
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.graph.candidates import covisible_pairs
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import check_map
-from slimsfm.synthetic.city import CityOptions, city_map
 
 
 def city(images=60, **options):
@@ -76,14 +76,14 @@ def test_matches_join_keypoints_that_see_the_same_point(small):
 
 
 @pytest.mark.parametrize("edges", ["matches", "tracks", "localize"])
-def test_neighbours_localize_each_other(small, edges):
+def test_neighbors_localize_each_other(small, edges):
     adjacency = compute_graph(small, GraphOptions(edges=edges)).graph.adjacency().toarray()
     assert all(adjacency[i, i + 1] and adjacency[i + 1, i] for i in range(59))
     assert all(adjacency[i, i + 30] and adjacency[i + 30, i] for i in range(30))
     assert adjacency.sum() < 60 * 59 / 2
 
 
-def test_it_is_read_as_it_was_written(small, tmp_path):
+def test_a_written_city_can_be_read(small, tmp_path):
     write_map(small, tmp_path / "city")
     read = read_map(tmp_path / "city")
     assert list(read.images) == list(small.images)
@@ -105,7 +105,7 @@ def test_equal_options_make_equal_cities_and_another_seed_another(small):
 
 
 @pytest.mark.parametrize("values", [{"images": 39}, {"laps": 0}, {"images": 100, "laps": 6}])
-def test_a_city_too_small_is_refused(values):
+def test_a_city_that_is_too_small_is_an_error(values):
     with pytest.raises(ValueError, match="images must be at least 20 a lap"):
         CityOptions(**values)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from slimsfm.synthetic.deception import (
+from deception import (
     DECEPTIONS,
     FLOOR_PERIOD,
     TWIN_FROM_OBJECT,
@@ -91,7 +91,7 @@ def test_the_room_is_the_same_in_both_takes():
     assert all(np.array_equal(one, other) for one, other in zip(*parts, strict=True))
 
 
-def test_in_the_room_the_carton_is_at_times_small_hidden_or_at_the_rim_but_never_away():
+def test_in_the_room_the_carton_is_sometimes_small_hidden_or_at_the_rim_but_never_absent():
     take = patterned_room_query(30, 80, 60, 0)
     alone = Scene([label_box(0)], Light())
     seen, whole = (

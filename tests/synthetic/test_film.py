@@ -3,8 +3,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from film import film
 from slimsfm.geometry import project
-from slimsfm.synthetic.film import film
 from slimsfm.synthetic.render import visible_meshes
 
 FRAMES = 400
@@ -46,13 +46,13 @@ def test_films_are_equal_for_equal_arguments_and_noise_differs_between_frames(sh
     assert not np.array_equal(one.frame(0), one.frame(1))
 
 
-def test_there_is_one_pose_and_one_share_a_frame(shot):
+def test_there_is_one_pose_and_one_share_per_frame(shot):
     assert len(shot.cam_from_object) == FRAMES
     assert shot.visible.shape == (FRAMES,)
     assert np.all((shot.visible >= 0) & (shot.visible <= 1))
 
 
-def test_all_is_continuous_but_the_cut_which_is_a_jump(shot):
+def test_the_motion_is_continuous_except_at_the_cut(shot):
     steps, turns = steps_px(shot), turns_deg(shot)
     others = np.arange(FRAMES - 1) != shot.cut - 1
     assert steps[~others].item() > 80
@@ -117,6 +117,6 @@ def test_in_a_short_film_of_another_object_the_same_happens(short):
 @pytest.mark.parametrize(
     ("name", "frames", "message"), [("teapot", 200, "name must be"), ("can", 199, "frames must be")]
 )
-def test_unknown_objects_and_films_too_short_are_refused(name, frames, message):
+def test_unknown_objects_and_short_films_are_errors(name, frames, message):
     with pytest.raises(ValueError, match=message):
         film(name, frames, 64, 48)

@@ -6,7 +6,7 @@ from slimsfm.synthetic.scene import object_box
 
 
 @pytest.mark.parametrize("make", OBJECTS.values(), ids=OBJECTS.keys())
-def test_an_object_is_metric_centred_closed_and_textured(make):
+def test_an_object_is_metric_centered_closed_and_textured(make):
     mesh = make(0)
     box = object_box(mesh)
     assert 0.1 < box.diagonal < 0.35

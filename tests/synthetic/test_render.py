@@ -28,7 +28,7 @@ def chequerboard(squares=8, texels=60):
 @pytest.mark.parametrize(
     "eye", [(0.1, -0.2, 0.45), (0.3, 0.1, 0.35), (-0.25, -0.15, 0.3)], ids=["near", "right", "slanted"]
 )
-def test_known_points_appear_where_projection_says(camera, eye):
+def test_known_points_appear_at_their_projections(camera, eye):
     scene = Scene([shapes.ground(0.32, chequerboard(), z=0.0)], AMBIENT)
     cam_from_world = look_at(np.array(eye), np.array([0.01, 0.02, 0.0]), roll_deg=20.0)
     steps = np.arange(-3, 4) * 0.04
@@ -95,6 +95,6 @@ def test_equal_scenes_give_equal_images():
     assert np.array_equal(*images)
 
 
-def test_a_mesh_without_texture_is_refused():
+def test_a_mesh_without_texture_is_an_error():
     with pytest.raises(ValueError, match="meshes must have a texture"):
         Scene([trimesh.creation.box()], AMBIENT)

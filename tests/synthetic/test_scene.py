@@ -50,6 +50,6 @@ def test_frames_are_equal_for_equal_arguments_and_noise_differs_between_frames()
     assert not np.array_equal(one.frame(1), one.frame(2))
 
 
-def test_an_unknown_object_is_refused():
+def test_an_unknown_object_is_an_error():
     with pytest.raises(ValueError, match="name must be one of"):
         mapping_take("teapot", 1, 64, 48, 0)

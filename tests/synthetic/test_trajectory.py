@@ -20,7 +20,7 @@ def azimuths_deg(path):
     return np.degrees(np.arctan2(eyes(path)[:, 1], eyes(path)[:, 0]))
 
 
-def test_a_camera_stands_at_its_eye_and_sees_the_target_at_its_centre_upright():
+def test_a_camera_stands_at_its_eye_and_sees_the_target_upright_at_its_center():
     eye, target = np.array([0.3, -0.5, 0.4]), np.array([0.02, 0.01, -0.03])
     pose = look_at(eye, target)
     assert np.allclose(pose.inverse().translation, eye)
@@ -37,7 +37,7 @@ def test_a_positive_roll_turns_the_picture_counterclockwise():
     assert abs(above[1] - 237) < 1e-9
 
 
-def test_a_vertical_view_is_refused():
+def test_a_vertical_view_is_an_error():
     with pytest.raises(ValueError, match="must not be straight above"):
         look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))
 
@@ -52,7 +52,7 @@ def test_the_mapping_path_covers_the_upper_hemisphere(frames):
     assert np.allclose(np.linalg.norm(eyes(path), axis=1), 0.5, rtol=0.09)
 
 
-def test_the_query_path_goes_all_round_elsewhere():
+def test_the_query_path_goes_around_the_object_on_other_positions():
     query, mapping = query_path(np.random.default_rng(0), 40, 0.6), mapping_path(60, 0.5)
     gaps = np.linalg.norm(eyes(query)[:, None] - eyes(mapping)[None], axis=2).min(axis=1)
     assert np.diff(np.sort(azimuths_deg(query))).max() < 20

@@ -12,16 +12,17 @@ import tyro
 from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, OutputPath, Stopwatch, console, finish, parse
-from slimsfm.cli.results import print_comparisons, report_run
+from slimsfm.cli.results import print_comparisons, print_summary
 from slimsfm.datasets import DATASETS
 from slimsfm.datasets.base import Dataset
 from slimsfm.errors import InputError
-from slimsfm.evaluation.benchmark import Bench, BenchmarkOptions
+from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup
 from slimsfm.evaluation.comparison import compare_runs
-from slimsfm.evaluation.result_files import digest_of, read_run
+from slimsfm.evaluation.result_files import digest_of, read_run, write_results
 from slimsfm.evaluation.run import run_benchmark
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.progress import shown
+from slimsfm.report.formatting import plural
 
 _USAGE = """usage: slimsfm benchmark DATASET PATH -o RUN   (more: slimsfm benchmark DATASET --help)
        slimsfm benchmark --compare RUN RUN
@@ -58,21 +59,23 @@ def benchmark(
     networks.apply()
     if (build.extractor, build.matcher) != (BuildOptions().extractor, BuildOptions().matcher):
         raise InputError("build.extractor and build.matcher: name them as --methods EXTRACTOR+MATCHER")
-    bench = Bench(folder=output, options=comparison, build=build, progress=shown)
+    setup = BenchmarkSetup(folder=output, options=comparison, build=build, progress=shown)
     with resumable():
-        run = run_benchmark(dataset, bench, execution.open_executor(), shown, overwrite=overwrite)
+        run = run_benchmark(dataset, setup, execution.open_executor(), shown, overwrite=overwrite)
     run = replace(run, options={"command": command, **run.options})
     if run.objects:
-        report_run(run)
+        print_summary(write_results(run))
     for name, why in run.failed.items():
-        console.print(f"{name}: could not be measured: {why}", style="red")
+        console.print(f"{name} failed: {why}", style="red")
     if run.failed:
         name, why = next(iter(run.failed.items()))
-        count = f"{len(run.failed)} of {len(run.failed) + len(run.objects)}"
-        raise InputError(f"{name}: {why} ({count} objects could not be measured; mend and run it again)")
+        count = f"{len(run.failed)} of {plural(len(run.failed) + len(run.objects), 'object')}"
+        raise InputError(f"{name}: {why} ({count} failed; fix the cause and run the same command again)")
     queries = sum(len(one.queries) for one in run.objects)
-    what = f"{output}: {len(run.objects)} objects, {queries} queries, digest {digest_of(run.objects)}"
-    finish(what, watch, "report", output, "-o", "report.html")
+    counts = f"{plural(len(run.objects), 'object')}, {plural(queries, 'query')}"
+    finish(
+        f"{output}: {counts}, digest {digest_of(run.objects)}", watch, "report", output, "-o", "report.html"
+    )
 
 
 def compare(before: Path, after: Path) -> None:
@@ -95,7 +98,7 @@ def main(arguments: Sequence[str]) -> None:
             raise InputError(f"--compare takes two runs, got {len(rest)}; see slimsfm benchmark --help")
         compare(*(Path(one) for one in rest))
     elif kind not in DATASETS:
-        raise InputError(f"{kind!r} is no kind of data set; there are {', '.join(DATASETS)}")
+        raise InputError(f"{kind!r} is not a kind of data set; choose one of {', '.join(DATASETS)}")
     else:
         typed = shlex.join(["slimsfm", "benchmark", *arguments])
         parse(_command(DATASETS[kind], typed), rest, kind)

@@ -7,10 +7,11 @@ from typing import Annotated
 import tyro
 
 from slimsfm.cli.output import Stopwatch, console, finish, parse
-from slimsfm.cli.results import report_run
+from slimsfm.cli.results import print_summary
 from slimsfm.datasets.synthetic import SynthesisOptions, Synthetic, synthesize
 from slimsfm.errors import OutputError
-from slimsfm.evaluation.benchmark import Bench
+from slimsfm.evaluation.benchmark import BenchmarkSetup
+from slimsfm.evaluation.result_files import write_results
 from slimsfm.evaluation.run import run_benchmark
 from slimsfm.execution import num_cores, processes
 from slimsfm.progress import shown
@@ -36,12 +37,12 @@ def demo(
         synthesize(folder, _OBJECTS, overwrite=overwrite, progress=shown, executor=executor)
     console.print(f"rendered {', '.join(_OBJECTS.objects)}: {watch}")
     dataset = Synthetic(path=folder, objects=_OBJECTS.objects)
-    bench = Bench(folder=output / "run", progress=shown)
-    run = run_benchmark(dataset, bench, progress=shown, overwrite=overwrite)
+    setup = BenchmarkSetup(folder=output / "run", progress=shown)
+    run = run_benchmark(dataset, setup, progress=shown, overwrite=overwrite)
     console.print(f"mapped, reduced, localized: {watch}")
-    report_run(run)
+    print_summary(write_results(run))
     write_report(report, run, overwrite=True)
-    finish(f"{bench.folder / 'results.json'} and {report}", watch, "build", "PHOTOS", "-o", "MAP")
+    finish(f"{setup.folder / 'results.json'} and {report}", watch, "build", "PHOTOS", "-o", "MAP")
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -13,9 +13,8 @@ from rich.markup import escape
 from slimsfm.arrays import Image
 from slimsfm.cli.output import OutputPath, Stopwatch, check_output, console, finish, parse
 from slimsfm.errors import ImageError, InputError
-from slimsfm.evaluation.outcomes import Outcomes, join
 from slimsfm.evaluation.result_files import read_run
-from slimsfm.evaluation.results import Cell, ObjectResult, Run
+from slimsfm.evaluation.results import Measurement, ObjectResult, Outcomes, Run, join_outcomes
 from slimsfm.evaluation.table import BY_FRAME, average_rows, rows_of
 from slimsfm.mapping.subset import keep_images
 from slimsfm.photos import read_image, shrink
@@ -123,8 +122,8 @@ def _draw_overall(studio: _Studio, run: Run) -> None:
         return
     studio.save(frontier_chart(rows), Path(), "frontier")
     for method in dict.fromkeys(row.method for row in rows):
-        cells = [_compared(result, method)[1] for result in run.objects if _cells(result, method)]
-        outcomes = join([cell.trials[0].outcomes for cell in cells])
+        some = [_compared(result, method)[1] for result in run.objects if _measurements(result, method)]
+        outcomes = join_outcomes([one.map_runs[0].outcomes for one in some])
         studio.save(reliability_chart(outcomes), Path(), "reliability", f"reliability-{method}")
 
 
@@ -139,23 +138,23 @@ def _draw_method(studio: _Studio, opened: OpenedObject) -> None:
     thumbnails = {name: shrink(photo, _THUMBNAIL_PX) for name, photo in photos.items() if photo is not None}
     graph = graph_figure(opened.graph, mapped.dominating_set, thumbnails, opened.threshold)
     studio.save(graph, folder, "graph")
-    before, after = (cell.trials[0].outcomes for cell in _compared(result, mapped.method))
+    before, after = (one.map_runs[0].outcomes for one in _compared(result, mapped.method))
     places = reference_places(full, reduced), query_places(result.queries, before, after)
     studio.save(sphere_chart(result.box, *places), folder, "sphere")
     studio.save(reliability_chart(after), folder, "reliability")
     _draw_queries(studio, result, after, folder)
 
 
-def _cells(result: ObjectResult, method: str) -> list[Cell]:
-    return [cell for cell in result.cells if cell.method == method]
+def _measurements(result: ObjectResult, method: str) -> list[Measurement]:
+    return [one for one in result.measurements if one.method == method]
 
 
-def _compared(result: ObjectResult, method: str) -> tuple[Cell, Cell]:
+def _compared(result: ObjectResult, method: str) -> tuple[Measurement, Measurement]:
     """The full map and the dominating set by the first strategy that both were measured with.
 
     Where there is none, what comes nearest: any two maps by one strategy, or one map twice.
     """
-    cells = _cells(result, method)
+    cells = _measurements(result, method)
     pairs = [(a, b) for a in cells for b in cells if a.strategy == b.strategy and a.variant == "full"]
     for wanted in ("dominating", None, "full"):
         for before, after in pairs:

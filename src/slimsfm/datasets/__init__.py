@@ -1,12 +1,10 @@
-"""Data sets on disk: one layout a file."""
+"""Data sets on disk, in their published layouts."""
 
 from slimsfm.datasets.base import Dataset
 from slimsfm.datasets.bop import Bop
-from slimsfm.datasets.colmap import Colmap
-from slimsfm.datasets.images import Images
 from slimsfm.datasets.linemod import Linemod
-from slimsfm.datasets.onepose import OnePose
-from slimsfm.datasets.onepose_lowtexture import OnePoseLowTexture
+from slimsfm.datasets.onepose import OnePose, OnePoseLowTexture
+from slimsfm.datasets.reconstructed import Colmap, Images
 from slimsfm.datasets.synthetic import Synthetic
 
 DATASETS: dict[str, type[Dataset]] = {
@@ -18,4 +16,4 @@ DATASETS: dict[str, type[Dataset]] = {
     "images": Images,
     "synthetic": Synthetic,
 }
-"""The data sets by the names that the command line has for them."""
+"""Data sets by their names on the command line."""

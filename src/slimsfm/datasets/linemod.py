@@ -1,16 +1,16 @@
 """The LINEMOD data set [1] as CDPN [2] publishes it and OnePose++ reads it.
 
-    ROOT/real_train/OBJECT/7-color.png    image number 7 that maps the object, 640 x 480; about 15 % of all
-    ROOT/real_train/OBJECT/7-pose.txt     3x4: camera from object in that image, in metres
-    ROOT/real_test/OBJECT/...             the same for the images that are queries
-    ROOT/models/OBJECT/OBJECT.ply         the object's model, in metres
-    ROOT/models/models_info.txt           a line an object, in millimetres:
+    ROOT/real_train/OBJECT/7-color.png    mapping image 7, 640 x 480; about 15 % of all images
+    ROOT/real_train/OBJECT/7-pose.txt     3x4: camera from object in that image, in meters
+    ROOT/real_test/OBJECT/...             the same for the queries
+    ROOT/models/OBJECT/OBJECT.ply         model of the object, in meters
+    ROOT/models/models_info.txt           one line per object, in millimeters:
                                           `1 diameter 102.1 min_x -37.9 ... size_x 75.9 ... size_z 91.8`
 
-Objects are called ape, benchvise, camera, ...; models_info.txt has their numbers. Numbers of images may have
-leading zeros. Other files, such as masks and 2D boxes, are not read. All images have one camera, which lies
-in no file but is the same in both tools: fx 572.4114, fy 573.57043, cx 325.2611, cy 242.04899, in OpenCV's
-convention. Eggbox and glue count as symmetric, and so do bowl and cup where there are images of them.
+The names of the objects are ape, benchvise, camera, ...; models_info.txt refers to them by number. Image
+numbers may have leading zeros. Other files, such as masks and 2D boxes, are not read. All images share one
+camera, which is not in the files but equal in both tools: fx 572.4114, fy 573.57043, cx 325.2611, cy
+242.04899, in OpenCV's convention. Eggbox and glue count as symmetric, and so do bowl and cup.
 
 References:
     [1] Hinterstoisser et al., Model Based Training, Detection and Pose Estimation of Texture-Less 3D Objects
@@ -24,15 +24,15 @@ from pathlib import Path
 
 import numpy as np
 
-from slimsfm.datasets.base import Making, ObjectSequences, PosedSequence
+from slimsfm.datasets.base import LoadOptions, ObjectSequences, PosedSequence
 from slimsfm.datasets.object_model import ListedModel, read_object_model
 from slimsfm.datasets.reading import (
-    check_known,
+    check_object_name,
     check_paired,
     equal_size,
     folders,
     numbered,
-    pinhole,
+    pinhole_camera,
     read_pose,
     read_text,
 )
@@ -64,26 +64,26 @@ _SIZE = (640, 480)
 
 @dataclass(frozen=True, kw_only=True)
 class Linemod:
-    """LINEMOD with real images for mapping and for queries, as CDPN publishes it."""
+    """LINEMOD with real images for mapping and queries, as published with CDPN."""
 
     path: Path
-    """Folder that holds real_train, real_test and models."""
+    """Folder with real_train, real_test and models."""
 
     def names(self) -> tuple[str, ...]:
-        """The objects, sorted."""
+        """Sorted names of the objects."""
         names = tuple(sorted(path.name for path in folders(self.path / "real_train")))
         if not names:
-            raise InputError(f"{self.path / 'real_train'} holds no folder: it takes one for each object")
-        if strange := sorted(set(names) - _NUMBERS.keys()):
+            raise InputError(f"{self.path / 'real_train'} holds no folder: one per object is required")
+        if unknown := sorted(set(names) - _NUMBERS.keys()):
             raise InputError(
-                f"{self.path / 'real_train' / strange[0]} is called as no object of LINEMOD; "
-                f"there is {', '.join(_NUMBERS)}"
+                f"{self.path / 'real_train' / unknown[0]} does not have the name of a LINEMOD object; "
+                f"the names are {', '.join(_NUMBERS)}"
             )
         return names
 
-    def load(self, name: str, making: Making) -> ObjectSequences:  # noqa: ARG002
-        """Read one object: its images in real_train map it, those in real_test are queries."""
-        check_known(name, self.names(), self.path)
+    def load(self, name: str, options: LoadOptions) -> ObjectSequences:  # noqa: ARG002
+        """Read one object: mapping images from real_train, queries from real_test."""
+        check_object_name(name, self.names(), self.path)
         models = self.path / "models"
         listed = _read_listed(models / "models_info.txt", _NUMBERS[name])
         return ObjectSequences(
@@ -109,7 +109,7 @@ def _read_images(directory: Path) -> PosedSequence:
     return PosedSequence(
         folder=directory,
         names=tuple(path.name for path in paths),
-        cameras=(pinhole(_INTRINSICS, size, directory),) * len(paths),
+        cameras=(pinhole_camera(_INTRINSICS, size, directory),) * len(paths),
         cam_from_world=tuple(read_pose(path, (3, 4)) for path in poses.values()),
     )
 
@@ -118,7 +118,7 @@ def _read_listed(path: Path, number: int) -> ListedModel:
     lines = [line.split() for line in read_text(path).splitlines()]
     found = [words for words in lines if words[:1] == [str(number)]]
     if len(found) != 1:
-        raise InputError(f"{path} must have one line of object {number}, got {len(found)}")
+        raise InputError(f"{path} must have one line for object {number}, got {len(found)}")
     words = found[0][1:]
     listed = dict(zip(words[::2], words[1::2], strict=False))
-    return ListedModel.from_millimetres(listed, f"{path}, object {number},")
+    return ListedModel.from_millimeters(listed, f"{path}, object {number},")

@@ -1,4 +1,4 @@
-"""Models of objects that come with data sets: PLY files, and what is listed of them beside."""
+"""3D models that come with data sets: PLY files, and the sizes that data sets list for them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,33 +14,33 @@ from slimsfm.datasets.base import ObjectModel
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
 
-MILLIMETRE = 1e-3
-"""In metres."""
+MILLIMETER = 1e-3
+"""One millimeter in meters."""
 
-_METRES = {"metre": 1.0, "millimetre": MILLIMETRE}
+_METERS = {"meter": 1.0, "millimeter": MILLIMETER}
 _FEWEST_VERTICES = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ListedModel:
-    """What BOP's models_info lists of a model."""
+    """Box and diameter of a model, from BOP's models_info."""
 
     box: Box
-    """Its axis-aligned box, in metres."""
+    """Axis-aligned box, in meters."""
 
     diameter: float
-    """Largest distance of two of its vertices, in metres."""
+    """Largest distance between two vertices, in meters."""
 
     @classmethod
-    def from_millimetres(cls, listed: Mapping[str, Any], source: str) -> "ListedModel":
-        """Take min_x, size_x, diameter and so on, which are in millimetres.
+    def from_millimeters(cls, listed: Mapping[str, Any], source: str) -> "ListedModel":
+        """Convert the entries min_x, size_x, diameter and so on from millimeters.
 
         Raises:
-            InputError: One is missing or cannot be; the message names the source.
+            InputError: An entry is missing or invalid; the message names the source.
         """
         keys = [f"{kind}_{axis}" for kind in ("min", "size") for axis in "xyz"] + ["diameter"]
         try:
-            values = MILLIMETRE * np.array([float(listed[key]) for key in keys])
+            values = MILLIMETER * np.array([float(listed[key]) for key in keys])
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{source} must have {', '.join(keys)}, each a number") from error
         low, size, diameter = values[:3], values[3:6], float(values[6])
@@ -55,23 +55,23 @@ def read_object_model(
     path: Path,
     box: Box,
     *,
-    unit: Literal["metre", "millimetre"] = "metre",
+    unit: Literal["meter", "millimeter"] = "meter",
     diameter: float | None = None,
     symmetric: bool,
 ) -> ObjectModel:
     """Read the model of an object from a PLY file.
 
     Args:
-        path: The file, text or binary, a mesh or a cloud of points.
-        box: The object's box, in metres; a model of quite another size is in another unit and refused.
-        unit: Of the vertices in the file.
-        diameter: Known diameter, in metres; None computes it.
-        symmetric: Whether poses that look alike count as equal.
+        path: A PLY file, text or binary, with a mesh or a point cloud.
+        box: Box of the object, in meters. A model of a very different size has another unit and is an error.
+        unit: Unit of the vertices in the file.
+        diameter: Known diameter, in meters; None computes it.
+        symmetric: Whether poses with equal appearance count as equal.
 
     Raises:
-        InputError: The file is missing or damaged, or the model is not about as large as the box.
+        InputError: The file is missing or damaged, or the sizes of model and box differ a lot.
     """
-    vertices = _METRES[unit] * read_vertices(path)
+    vertices = _METERS[unit] * read_vertices(path)
     check_size(float(np.linalg.norm(np.ptp(vertices, axis=0))), box, f"{path}, in {unit}s,")
     if diameter is None:
         diameter = largest_distance(vertices)
@@ -79,10 +79,10 @@ def read_object_model(
 
 
 def check_size(extent: float, box: Box, what: str) -> None:
-    """Make sure that something is about as large as the object's box.
+    """Check that an extent is similar to the diagonal of the object's box.
 
     Raises:
-        InputError: It is not, so it must be in another unit.
+        InputError: The sizes differ a lot, which indicates different units.
     """
     ratio = extent / box.diagonal
     if not 0.4 < ratio < 2.5:
@@ -90,10 +90,10 @@ def check_size(extent: float, box: Box, what: str) -> None:
 
 
 def read_vertices(path: Path) -> Points3D:
-    """The vertices of a PLY file, in its unit.
+    """The vertices of a PLY file, in the unit of the file.
 
     Raises:
-        InputError: It is missing or damaged, or holds fewer than four.
+        InputError: The file is missing or damaged, or holds fewer than four vertices.
     """
     from trimesh.exchange.ply import load_ply  # slow to import, and few data sets have models
 
@@ -103,7 +103,7 @@ def read_vertices(path: Path) -> Points3D:
             vertices = np.array(found, np.float64)
     except FileNotFoundError as error:
         raise InputError(f"{path} cannot be read: there is no such file") from error
-    except Exception as error:  # damaged files make trimesh fail in many ways
+    except Exception as error:  # trimesh raises many kinds of errors for damaged files
         raise InputError(f"{path} cannot be read as a PLY file: {error}") from error
     shape = vertices.shape
     if len(shape) != 2 or shape[1] != 3 or shape[0] < _FEWEST_VERTICES or not np.all(np.isfinite(vertices)):
@@ -112,6 +112,6 @@ def read_vertices(path: Path) -> Points3D:
 
 
 def largest_distance(points: Points3D) -> float:
-    """The largest distance of two of the points, which are corners of their convex hull."""
-    corners = ConvexHull(points, qhull_options="QJ").vertices  # joggled, for points may lie in a plane
+    """Largest distance between two points; both are vertices of the convex hull."""
+    corners = ConvexHull(points, qhull_options="QJ").vertices  # joggled, because points may lie in a plane
     return float(pdist(points[corners]).max())

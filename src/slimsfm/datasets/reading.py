@@ -1,7 +1,7 @@
-"""What the readers of data sets share: files are checked when they are read, and every error names the file.
+"""Shared helpers of the data set readers: they check each file, and every error names the file.
 
-Intrinsic matrices in files give the principal point as OpenCV does, with the centre of the top-left pixel at
-(0, 0). So COLMAP's cx is the file's plus 0.5; `pinhole` adds it, for all data sets.
+Intrinsic matrices in files follow OpenCV, where the center of the top-left pixel is at (0, 0). So COLMAP's cx
+is the value in the file plus 0.5; `pinhole_camera` adds it for all data sets.
 """
 
 import json
@@ -19,19 +19,19 @@ from PIL import Image as PilImage
 from slimsfm.errors import ImageError, InputError
 
 PIXEL_CENTER = 0.5
-"""Where the centre of the top-left pixel lies in COLMAP's convention, in both directions."""
+"""Both coordinates of the center of the top-left pixel in COLMAP's convention."""
 
 _DAMAGED_IMAGE = (OSError, ValueError, SyntaxError, PilImage.DecompressionBombError)
 
 
 def folders(directory: Path) -> list[Path]:
-    """Visible folders in the order of the numbers in their names, so that box-10 comes after box-2.
+    """Visible folders, sorted by the numbers in their names, so that box-10 comes after box-2.
 
     Raises:
-        InputError: There is no such directory.
+        InputError: The directory does not exist.
     """
     if not directory.is_dir():
-        raise InputError(f"{directory} is no folder: check the path")
+        raise InputError(f"{directory} is not a folder: check the path")
     found = [path for path in directory.iterdir() if path.is_dir() and not path.name.startswith(".")]
     return sorted(
         found, key=lambda path: [(int(d or -1), text) for d, text in re.findall(r"(\d+)|(\D+)", path.name)]
@@ -39,49 +39,49 @@ def folders(directory: Path) -> list[Path]:
 
 
 def check_frame_step(frame_step: int) -> None:
-    """Refuse a step that is none.
+    """Check a step between frames.
 
     Raises:
-        ValueError: It is below 1.
+        ValueError: The step is below 1.
     """
     if frame_step < 1:
         raise ValueError(f"frame_step must be at least 1, got {frame_step}")
 
 
-def check_known(name: str, names: Sequence[str], path: Path) -> None:
-    """Make sure that an object is one of the data set.
+def check_object_name(name: str, names: Sequence[str], path: Path) -> None:
+    """Check that the data set has an object of this name.
 
     Raises:
-        InputError: It is not.
+        InputError: The name is not in `names`.
     """
     if name not in names:
         raise InputError(f"{path} has no object {name!r}; it has {', '.join(names)}")
 
 
 def numbered(directory: Path, ending: str) -> dict[int, Path]:
-    """Files called by a number and an ending, by that number, ascending.
+    """Files whose name is a number and an ending, by that number, ascending.
 
     Raises:
-        InputError: There is none.
+        InputError: The directory holds no such file.
     """
     stems = ((path, path.name.removesuffix(ending)) for path in directory.glob(f"*{ending}"))
     paths = {int(stem): path for path, stem in stems if stem.isdecimal()}
     if not paths:
-        raise InputError(f"{directory} holds no file 0{ending}, 1{ending}, ...: it takes one for each frame")
+        raise InputError(f"{directory} holds no file 0{ending}, 1{ending}, ...: one per frame is required")
     return dict(sorted(paths.items()))
 
 
 def check_paired(frames: Mapping[int, Path], others: Mapping[int, Path], what: str, hint: str = "") -> None:
-    """Make sure that every frame has its other file, such as a pose, and the other way round.
+    """Check that frames and other files, such as poses, have the same numbers.
 
     Args:
         frames: Image files by number.
-        others: What belongs to them, by number.
-        what: One of the others, in a word.
+        others: The other files by number.
+        what: What one of the other files holds, such as "pose".
         hint: Added to the message.
 
     Raises:
-        InputError: One has no partner; the first is named.
+        InputError: A file has no partner; the message names the first one.
     """
     if alone := sorted(frames.keys() ^ others.keys()):
         is_frame = alone[0] in frames
@@ -89,7 +89,7 @@ def check_paired(frames: Mapping[int, Path], others: Mapping[int, Path], what: s
         missing = what if is_frame else "frame"
         folder = next(iter((others if is_frame else frames).values())).parent.name
         raise InputError(
-            f"{path} has no {missing} in {folder}: add it or take this file away "
+            f"{path} has no {missing} in {folder}: add it or remove this file "
             f"({len(frames)} frames, {len(others)} of {what}){hint}"
         )
 
@@ -98,7 +98,7 @@ def read_text(path: Path) -> str:
     """Read a text file.
 
     Raises:
-        InputError: It is missing or no text.
+        InputError: The file is missing or not text.
     """
     try:
         return path.read_text()
@@ -112,7 +112,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object.
 
     Raises:
-        InputError: It is missing or damaged, or holds something else.
+        InputError: The file is missing or damaged, or does not hold a JSON object.
     """
     try:
         data = json.loads(read_text(path))
@@ -124,15 +124,15 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_matrix(path: Path, rows: Sequence[int], columns: int) -> Float64[np.ndarray, "rows columns"]:
-    """Read a matrix, a line of the file a row.
+    """Read a matrix from a text file with one row per line.
 
     Args:
         path: A text file.
-        rows: How many rows it may have.
-        columns: How many numbers are in each of them.
+        rows: Accepted numbers of rows.
+        columns: Number of columns.
 
     Raises:
-        InputError: It is missing, has another shape or a number in it is not finite.
+        InputError: The file is missing, has another shape or a value that is not finite.
     """
     text, shape = read_text(path), f"{' or '.join(map(str, rows))} rows of {columns}"
     try:
@@ -147,49 +147,49 @@ def read_matrix(path: Path, rows: Sequence[int], columns: int) -> Float64[np.nda
 
 
 def read_pose(path: Path, rows: Sequence[int] = (4,)) -> pycolmap.Rigid3d:
-    """Read a pose: a rotation, beside it a translation and, where there is a fourth row, 0 0 0 1.
+    """Read a pose: a 3x4 matrix of rotation and translation, or 4x4 with the last row 0 0 0 1.
 
     Raises:
-        InputError: The file is missing or holds no pose.
+        InputError: The file is missing or does not hold a pose.
     """
     return rigid(read_matrix(path, rows, 4), path)
 
 
 def rigid(matrix: Float64[np.ndarray, "rows 4"], source: Path | str) -> pycolmap.Rigid3d:
-    """The rigid motion that a matrix of three or four rows stands for.
+    """The rigid transform of a 3x4 or 4x4 matrix.
 
     Raises:
-        InputError: It is none; the message names the source.
+        InputError: The matrix is not a rigid transform; the message names the source.
     """
     rotation = matrix[:3, :3]
     turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
     if not (turns and np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6)):
         raise InputError(
-            f"{source} is no pose: its first three columns must be a rotation and its last row 0 0 0 1"
+            f"{source} is not a pose: its first three columns must be a rotation and its last row 0 0 0 1"
         )
     turned = pycolmap.Rotation3d(rotation)
-    turned.normalize()  # files round
+    turned.normalize()  # values in files are rounded
     return pycolmap.Rigid3d(turned, matrix[:3, 3])
 
 
-def pinhole(
+def pinhole_camera(
     intrinsics: Float64[np.ndarray, "3 3"], size: tuple[int, int], source: Path | str
 ) -> pycolmap.Camera:
-    """The camera of an intrinsic matrix in OpenCV's convention, in COLMAP's.
+    """Convert an intrinsic matrix in OpenCV's convention to a camera in COLMAP's.
 
     Args:
         intrinsics: The matrix, in pixels.
         size: Width and height of the image.
-        source: Where the matrix comes from.
+        source: Origin of the matrix, for messages.
 
     Raises:
-        InputError: It is no matrix of a pinhole camera; the message names the source.
+        InputError: The matrix does not describe a pinhole camera; the message names the source.
     """
     (fx, skew, cx), (zero, fy, cy), last = intrinsics
     whole = np.all(np.isfinite(intrinsics)) and fx > 0 and fy > 0
     if not (whole and abs(skew) < 1e-6 * fx and zero == 0 and np.array_equal(last, (0, 0, 1))):
         raise InputError(
-            f"{source} must have positive focal lengths, a finite centre and no skew, "
+            f"{source} must have positive focal lengths, a finite principal point and no skew, "
             f"got {' '.join(f'{value:g}' for value in intrinsics.ravel())}"
         )
     params = [fx, fy, cx + PIXEL_CENTER, cy + PIXEL_CENTER]
@@ -197,17 +197,19 @@ def pinhole(
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, turned upright as EXIF says; mostly just its header is read.
+    """Width and height of an image after the EXIF rotation; reads only the header if possible.
 
     Raises:
-        ImageError: It is missing or no image.
+        ImageError: The file is missing or not an image.
     """
     try:
         with PilImage.open(path) as image:
             if image.format == "PNG" and "exif" not in image.info:
-                return image.size  # to look for it behind the pixels would decode them
+                return image.size  # EXIF after the pixels would require decoding them
             if image.format == "TIFF":
-                return ImageOps.exif_transpose(image).size  # before pixels are read Pillow may give either
+                return ImageOps.exif_transpose(
+                    image
+                ).size  # before reading pixels, Pillow may return either size
             turned = image.getexif().get(ExifTags.Base.Orientation, 1) >= 5
             width, height = image.size
             return (height, width) if turned else (width, height)
@@ -218,16 +220,16 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def equal_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """The size of images that share a camera.
+    """The common size of images that share a camera.
 
     Raises:
-        ImageError: One is missing, no image or of another size than the first.
+        ImageError: A file is missing, not an image or of another size than the first.
     """
     size = image_size(paths[0])
     for path in paths[1:]:
         if image_size(path) != size:
             raise ImageError(
                 f"{path} has {'x'.join(map(str, image_size(path)))} pixels, but {paths[0].name} has "
-                f"{'x'.join(map(str, size))}: frames of one video have one size"
+                f"{'x'.join(map(str, size))}: all frames of a video must have the same size"
             )
     return size

@@ -1,4 +1,4 @@
-"""Rendered objects in OnePose's layout: a data set with exact poses, made in seconds from a seed."""
+"""Rendered objects in OnePose's layout: a data set with exact poses, rendered in seconds from a seed."""
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -9,8 +9,8 @@ from pathlib import Path
 from PIL import Image as PilImage
 
 from slimsfm.datasets import onepose
-from slimsfm.datasets.base import Making, ObjectSequences
-from slimsfm.datasets.reading import check_known
+from slimsfm.datasets.base import LoadOptions, ObjectSequences
+from slimsfm.datasets.reading import check_object_name
 from slimsfm.errors import InputError
 from slimsfm.files import check_writable, replacing
 from slimsfm.progress import ProgressBar, silent
@@ -23,22 +23,22 @@ class SynthesisOptions:
     """What to render."""
 
     objects: tuple[str, ...] = tuple(OBJECTS)
-    """Names of objects; all by default."""
+    """Names of the objects; all by default."""
 
     mapping_frames: int = 60
-    """Frames of the video that maps an object: half a minute, two a second."""
+    """Frames of the mapping video: half a minute at two frames per second."""
 
     query_frames: int = 40
-    """Frames of the video that asks for poses."""
+    """Frames of the query video."""
 
     width: int = 640
-    """Of an image, in pixels."""
+    """Image width, in pixels."""
 
     height: int = 480
-    """Of an image, in pixels."""
+    """Image height, in pixels."""
 
     seed: int = 0
-    """Of prints, things around, unsteady hands and noise: equal options give equal bytes."""
+    """Seed of prints, surroundings, camera shake and noise: equal options give equal bytes."""
 
     def __post_init__(self) -> None:
         if (
@@ -46,7 +46,7 @@ class SynthesisOptions:
             or len(set(self.objects)) < len(self.objects)
             or not OBJECTS.keys() >= set(self.objects)
         ):
-            raise ValueError(f"objects must be different ones of {', '.join(OBJECTS)}, got {self.objects}")
+            raise ValueError(f"objects must be distinct and among {', '.join(OBJECTS)}, got {self.objects}")
         for field in ("mapping_frames", "query_frames", "width", "height"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be positive, got {getattr(self, field)}")
@@ -56,42 +56,42 @@ class SynthesisOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Synthetic:
-    """Rendered objects: those that are not there yet are rendered first."""
+    """Rendered objects; missing ones are rendered first."""
 
     path: Path
-    """Folder of the objects' folders."""
+    """Folder with one folder per object."""
 
     objects: tuple[str, ...] = tuple(OBJECTS)
-    """Names of objects; all by default."""
+    """Names of the objects; all by default."""
 
     mapping_frames: int | None = None
-    """Frames of the video that maps an object. Here and below: else as many as are there, or as `slimsfm
-    synthesize` renders by default."""
+    """Frames of the mapping video. By default here and below: the value of an existing object, or the default
+    of `slimsfm synthesize`."""
 
     query_frames: int | None = None
-    """Frames of the video that asks for poses."""
+    """Frames of the query video."""
 
     width: int | None = None
-    """Of an image, in pixels."""
+    """Image width, in pixels."""
 
     height: int | None = None
-    """Of an image, in pixels."""
+    """Image height, in pixels."""
 
     render_seed: int = 0
-    """Of what is rendered, as of `slimsfm synthesize`; objects that are there already may be of any."""
+    """Seed of new objects, as for `slimsfm synthesize`; existing objects may have any."""
 
     def __post_init__(self) -> None:
         self._options(self.objects)
 
     def names(self) -> tuple[str, ...]:
-        """The objects, sorted."""
+        """Sorted names of the objects."""
         return tuple(sorted(self.objects))
 
-    def load(self, name: str, making: Making) -> ObjectSequences:
-        """Read one object, rendered before where it is not there; one that is must be what is asked for."""
-        check_known(name, self.names(), self.path)
+    def load(self, name: str, options: LoadOptions) -> ObjectSequences:
+        """Read one object; render it first if it is missing. An existing one must match the options."""
+        check_object_name(name, self.names(), self.path)
         if not (self.path / name).exists():
-            synthesize(self.path, self._options((name,)), progress=making.progress)
+            synthesize(self.path, self._options((name,)), progress=options.progress)
         made = onepose.read_object(self.path / name)
         found = {
             "mapping_frames": len(made.mapping.names),
@@ -103,7 +103,7 @@ class Synthetic:
             if getattr(self, field) not in (None, value):
                 raise InputError(
                     f"{self.path / name} was rendered with {field} {value}, not {getattr(self, field)}: "
-                    "ask for what is there, or choose another folder"
+                    "use these values, or choose another folder"
                 )
         return made
 
@@ -115,7 +115,7 @@ class Synthetic:
 
 @dataclass(frozen=True, kw_only=True)
 class _TakeKey:
-    """All that a take depends on: little enough to send to another process."""
+    """The arguments of a take: small enough to send to another process."""
 
     kind: str
     name: str
@@ -133,20 +133,20 @@ def synthesize(
     progress: ProgressBar = silent,
     executor: Executor | None = None,
 ) -> list[ObjectSequences]:
-    """Render objects and write each as one of OnePose's: `NAME/NAME-1` maps it, `NAME/NAME-2` queries it.
+    """Render objects in OnePose's layout: `NAME/NAME-1` for mapping, `NAME/NAME-2` for queries.
 
     Args:
-        directory: Where the objects' folders go; made if missing. An object appears when it is complete.
+        directory: Folder for the objects; created if missing. An object appears when it is complete.
         options: What to render.
-        overwrite: Replace objects that are there already.
-        progress: Told of each frame.
-        executor: Renders frames elsewhere, such as a `ProcessPoolExecutor`; None renders here, one at a time.
+        overwrite: Replace existing objects.
+        progress: Progress callback, called once per frame.
+        executor: Renders frames in parallel, such as a `ProcessPoolExecutor`; None renders them here.
 
     Returns:
-        The objects as read back, in the order of `options.objects`.
+        The objects, read from the folder, in the order of `options.objects`.
 
     Raises:
-        OutputError: An object is there already, or the folder cannot be written.
+        OutputError: An object exists and `overwrite` is off, or the folder cannot be written.
     """
     for name in options.objects:
         check_writable(directory / name, overwrite=overwrite)

@@ -1,1 +1,1 @@
-"""Localizing queries of known pose against maps, and what comes of it."""
+"""Localize queries with known poses against maps, score the results and write them to disk."""

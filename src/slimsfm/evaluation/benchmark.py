@@ -1,18 +1,15 @@
-"""Methods times strategies times variants of the map, on one object: the paper's comparison."""
+"""Compare methods, strategies and variants of the map on one object, as in the paper."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slimsfm.datasets.base import Making as DatasetMaking
-from slimsfm.datasets.base import ObjectSequences
-from slimsfm.datasets.mapping import map_object
-from slimsfm.evaluation.methods import Method, parse_method
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
-from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Trial, map_path
-from slimsfm.evaluation.variants import Making, Variant, parse_variant
-from slimsfm.features.methods import DETECTOR_FREE
+from slimsfm.datasets.base import LoadOptions, ObjectSequences, map_object
+from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries, queries_of
+from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, map_path
+from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
+from slimsfm.features.methods import DETECTOR_FREE, EXTRACTORS, MATCHERS, plugins
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.graph.source import Edges
@@ -25,91 +22,121 @@ from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction import ReductionOptions, dominating_set
 
 
+@dataclass(frozen=True)
+class Method:
+    """Local features and their matcher."""
+
+    extractor: str
+    """Name of the extractor, see `slimsfm methods`."""
+
+    matcher: str | None = None
+    """Name of the matcher; None selects nearest neighbors, or the extractor itself if it has no keypoints."""
+
+    def __str__(self) -> str:
+        return self.extractor if self.matcher is None else f"{self.extractor}+{self.matcher}"
+
+
+def parse_method(text: str) -> Method:
+    """Read a method: EXTRACTOR, or EXTRACTOR+MATCHER as in `aliked+lightglue`.
+
+    Raises:
+        ValueError: The extractor or the matcher is unknown.
+    """
+    extractor, plus, matcher = text.partition("+")
+    extractors, matchers = {**EXTRACTORS, **plugins("extractor")}, {**MATCHERS, **plugins("matcher")}
+    if extractor not in extractors:
+        raise ValueError(f"the extractor of a method must be one of {', '.join(extractors)}, got {text!r}")
+    if plus and matcher not in matchers:
+        raise ValueError(f"the matcher of a method must be one of {', '.join(matchers)}, got {text!r}")
+    return Method(extractor, matcher or None)
+
+
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
-    """What is compared."""
+    """What to compare."""
 
     methods: tuple[str, ...] = ("sift",)
-    """Local features of references and queries, see `slimsfm methods`, with a matcher where images are not to
-    be matched by nearest neighbours: aliked+lightglue."""
+    """Local features of references and queries, see `slimsfm methods`. Add a matcher to replace nearest
+    neighbors: aliked+lightglue."""
 
     strategies: tuple[str, ...] = ("exhaustive", "retrieval", "progressive", "direct")
     """How queries are matched."""
 
     variants: tuple[str, ...] = ("full", "dominating", "default", "random")
-    """Which maps they are matched against: all of it (full), a dominating set of images (dominating, or
-    dominating:k=2,rim,budget=8), what `slimsfm reduce` gives by itself (default), as many images as in the
-    dominating set drawn at random (random, or random:8), so many points (points:500)."""
+    """Maps to match against: the full map (full), a dominating set of images (dominating, or
+    dominating:k=2,rim,budget=8), the default result of `slimsfm reduce` (default), as many random images as
+    the dominating set has (random, or random:8), a number of points (points:500)."""
 
     edges: Edges = "localize"
-    """How the reference graph is computed; the paper localizes each image from each other one."""
+    """How to compute the reference graph; the paper localizes each image from each other image."""
 
     reduction: ReductionOptions = ReductionOptions()
-    """How dominating sets are chosen."""
+    """How to choose dominating sets."""
 
     def __post_init__(self) -> None:
         for name in ("methods", "strategies", "variants"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise ValueError(f"{name} must be different ones, got {', '.join(values) or 'none'}")
+                raise ValueError(f"{name} must be distinct and not empty, got {', '.join(values) or 'none'}")
         _ = self.parsed_methods, self.parsed_variants
         for strategy in self.strategies:
-            LocalizationOptions(strategy=strategy)  # refuses what there is not
+            LocalizationOptions(strategy=strategy)  # raises for unknown strategies
 
     @property
     def parsed_methods(self) -> list[Method]:
-        """The methods."""
+        """`methods`, parsed."""
         return [parse_method(one) for one in self.methods]
 
     @property
     def parsed_variants(self) -> list[Variant]:
-        """The variants."""
+        """`variants`, parsed."""
         return [parse_variant(one) for one in self.variants]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bench:
-    """Where and how one object is measured."""
+class BenchmarkSetup:
+    """Folder and options of a benchmark."""
 
     folder: Path
-    """The run's folder."""
+    """Folder of the run."""
 
     options: BenchmarkOptions = BenchmarkOptions()
-    """What is compared."""
+    """What to compare."""
 
     build: BuildOptions = BuildOptions()
-    """How photos are mapped; methods say with which features."""
+    """How to map photos; the methods override extractor and matcher."""
 
     progress: ProgressBar = silent
-    """Told of long work."""
+    """Progress callback."""
 
-    def build_with(self, method: Method) -> BuildOptions:
-        """How photos are mapped with a method."""
+    def build_options(self, method: Method) -> BuildOptions:
+        """How to map photos with a method."""
         return replace(self.build, extractor=method.extractor, matcher=method.matcher or self.build.matcher)
 
-    def dataset_making(self, name: str) -> DatasetMaking:
-        """How the data set reconstructs photos whose poses are unknown."""
-        return DatasetMaking(
+    def load_options(self, name: str) -> LoadOptions:
+        """How the data set loads an object; photos without poses are reconstructed with the first method."""
+        return LoadOptions(
             folder=self.folder / "truth" / name,
-            build=self.build_with(self.options.parsed_methods[0]),
+            build=self.build_options(self.options.parsed_methods[0]),
             progress=self.progress,
         )
 
 
-def benchmark_object(sequences: ObjectSequences, bench: Bench) -> ObjectResult:
+def benchmark_object(sequences: ObjectSequences, setup: BenchmarkSetup) -> ObjectResult:
     """Map an object and localize its queries with every method and strategy against every variant.
 
-    A map for direct matching alone has no line for other strategies, nor one without keypoints for direct.
+    Impossible combinations are left out: a map that supports only direct matching has no measurement for
+    other strategies, and a map without keypoints has none for direct matching.
     """
     queries = [replace(query, path=query.path.resolve()) for query in queries_of(sequences.query)]
-    maps, cells = [], []
-    for method in bench.options.parsed_methods:
-        subject = _Subject(sequences, method, bench)
-        making = _making(subject)
-        maps.append(_mapped(method, making))
-        prepared = prepare(making.map, queries, bench.progress)
+    maps, measurements = [], []
+    for method in setup.options.parsed_methods:
+        task = _MethodTask(sequences, method, setup)
+        inputs = _variant_inputs(task)
+        maps.append(_mapped(method, inputs))
+        prepared = prepare_queries(inputs.map, queries, setup.progress)
         with tempfile.TemporaryDirectory(prefix="slimsfm-benchmark-") as temporary:
-            cells += _cells(subject, _stored(subject, making, Path(temporary)), prepared)
+            measurements += _measurements(task, _stored_maps(task, inputs, Path(temporary)), prepared)
     return ObjectResult(
         name=sequences.name,
         box=sequences.box,
@@ -117,30 +144,30 @@ def benchmark_object(sequences: ObjectSequences, bench: Bench) -> ObjectResult:
         images=sequences.mapping.folder.resolve(),
         queries=tuple(queries),
         maps=tuple(maps),
-        cells=tuple(cells),
+        measurements=tuple(measurements),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Subject:
-    """One object and one method."""
+class _MethodTask:
+    """One object to measure with one method."""
 
     sequences: ObjectSequences
     method: Method
-    bench: Bench
+    setup: BenchmarkSetup
 
     def map_path(self, variant: str) -> Path:
-        """Where the map of a variant is kept."""
-        return map_path(self.bench.folder, self.sequences.name, str(self.method), variant)
+        """Folder of the map of a variant."""
+        return map_path(self.setup.folder, self.sequences.name, str(self.method), variant)
 
 
-def _making(subject: _Subject) -> Making:
+def _variant_inputs(task: _MethodTask) -> VariantInputs:
     """The full map, its reference graph and its dominating set."""
-    options, progress = subject.bench.options, subject.bench.progress
-    full = _full_map(subject)
-    edges = graph_options(options, subject.method)
-    graph = load_or_compute_graph(full, subject.map_path("full"), edges, progress=progress).graph
-    return Making(
+    options, progress = task.setup.options, task.setup.progress
+    full = _full_map(task)
+    edges = graph_options(options, task.method)
+    graph = load_or_compute_graph(full, task.map_path("full"), edges, progress=progress).graph
+    return VariantInputs(
         map=full,
         graph=graph,
         reduction=options.reduction,
@@ -151,7 +178,7 @@ def _making(subject: _Subject) -> Making:
 
 
 def graph_options(options: BenchmarkOptions, method: Method) -> GraphOptions:
-    """How the reference graph of a method's map is computed."""
+    """How to compute the reference graph of a map with a method."""
     return GraphOptions(
         edges=options.edges,
         candidates="all",
@@ -160,69 +187,70 @@ def graph_options(options: BenchmarkOptions, method: Method) -> GraphOptions:
     )
 
 
-def _full_map(subject: _Subject) -> Map:
-    """The map of the mapping sequence; made unless an interrupted run left it."""
-    path, bench = subject.map_path("full"), subject.bench
+def _full_map(task: _MethodTask) -> Map:
+    """The map of the mapping sequence; built unless an interrupted run has stored it."""
+    path, setup = task.map_path("full"), task.setup
     if not path.exists():
         with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
-            options = bench.build_with(subject.method)
-            write_map(map_object(subject.sequences, Path(workspace), options, bench.progress), path)
+            options = setup.build_options(task.method)
+            write_map(map_object(task.sequences, Path(workspace), options, setup.progress), path)
     return read_map(path)
 
 
-def _mapped(method: Method, making: Making) -> MappedObject:
-    graph, solution = making.graph, making.solution
+def _mapped(method: Method, inputs: VariantInputs) -> MappedObject:
+    graph, solution = inputs.graph, inputs.solution
     names = tuple(graph.names[i] for i in solution.chosen)
     return MappedObject(
         method=str(method),
-        references=len(making.map.images),
-        points=len(making.map.point3D_ids),
-        edges=graph.num_edges(making.reduction.threshold),
+        references=len(inputs.map.images),
+        points=len(inputs.map.point3D_ids),
+        edges=graph.num_edges(inputs.reduction.threshold),
         dominating_set=names,
         lower_bound=int(solution.lower_bound),
-        dominating_points=len(keep_images(making.map, names).point3D_ids),
+        dominating_points=len(keep_images(inputs.map, names).point3D_ids),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _StoredMap:
-    """A map as read from disk, and its size there."""
+    """A map that was read from disk, and its size there."""
 
     map: Map
     bytes: int
 
 
-def _stored(subject: _Subject, making: Making, temporary: Path) -> dict[str, list[_StoredMap]]:
-    """The maps of every variant; random ones are not kept."""
+def _stored_maps(task: _MethodTask, inputs: VariantInputs, temporary: Path) -> dict[str, list[_StoredMap]]:
+    """The maps of every variant; random ones are stored in the temporary folder."""
     found: dict[str, list[_StoredMap]] = {}
-    for variant in subject.bench.options.parsed_variants:
+    for variant in task.setup.options.parsed_variants:
         found[variant.name] = []
-        for draw, made in enumerate(variant.make(making)):
-            path = temporary / f"{len(found)}-{draw}" if variant.is_random else subject.map_path(variant.name)
-            if made is not making.map:
+        for draw, made in enumerate(variant.make(inputs)):
+            path = temporary / f"{len(found)}-{draw}" if variant.is_random else task.map_path(variant.name)
+            if made is not inputs.map:
                 write_map(made, path, overwrite=True)
             found[variant.name].append(_StoredMap(read_map(path), bytes_by_part(path)["total"]))
     return found
 
 
-def _cells(
-    subject: _Subject, stored: dict[str, list[_StoredMap]], queries: Sequence[PreparedQuery]
-) -> Iterator[Cell]:
-    """Strategy by strategy, variant by variant."""
-    for strategy in subject.bench.options.strategies:
+def _measurements(
+    task: _MethodTask, stored: dict[str, list[_StoredMap]], queries: Sequence[PreparedQuery]
+) -> Iterator[Measurement]:
+    for strategy in task.setup.options.strategies:
         for variant, maps in stored.items():
             if maps and _is_possible(strategy, maps[0].map):
-                trials = tuple(_trial(subject, one, strategy, queries) for one in maps)
-                yield Cell(method=str(subject.method), strategy=strategy, variant=variant, trials=trials)
+                runs = tuple(_map_run(task, one, strategy, queries) for one in maps)
+                yield Measurement(method=str(task.method), strategy=strategy, variant=variant, map_runs=runs)
 
 
-def _trial(subject: _Subject, stored: _StoredMap, strategy: str, queries: Sequence[PreparedQuery]) -> Trial:
-    matcher, progress = subject.method.matcher or "auto", subject.bench.progress
-    return Trial(
+def _map_run(
+    task: _MethodTask, stored: _StoredMap, strategy: str, queries: Sequence[PreparedQuery]
+) -> MapRun:
+    matcher, progress = task.method.matcher or "auto", task.setup.progress
+    return MapRun(
         references=len(stored.map.images),
         points=len(stored.map.point3D_ids),
         map_bytes=stored.bytes,
-        outcomes=evaluate(stored.map, queries, strategy, matcher, progress, subject.sequences.model),
+        outcomes=evaluate(stored.map, queries, strategy, matcher, progress, task.sequences.model),
     )
 
 

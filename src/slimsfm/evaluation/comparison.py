@@ -1,42 +1,42 @@
-"""Two lines of the table on the same queries: what one gains, and whether that is chance."""
+"""Compare rows of the table on the same queries, and summarize dominating sets."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
 from slimsfm.errors import InputError
-from slimsfm.evaluation.results import Cell, ObjectResult, Run
-from slimsfm.evaluation.statistics import Interval, bootstrap, paired_p_value
-from slimsfm.evaluation.table import BY_FRAME, per_query
+from slimsfm.evaluation.results import Measurement, ObjectResult, Run
+from slimsfm.evaluation.scores import Interval, bootstrap, paired_p_value
+from slimsfm.evaluation.table import BY_FRAME, mean_over_draws
 from slimsfm.geometry import ADD_FRACTIONS
 
-Key = tuple[str, str, str]
+MeasurementKey = tuple[str, str, str]
 """Method, strategy and variant."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """How one line of the table stands against another, query by query."""
+    """Two rows of the table, compared query by query."""
 
     object: str
-    """Name of the object, or that of the average by frame."""
+    """Name of the object, or `BY_FRAME`."""
 
-    before: Key
-    """The line that is compared with."""
+    before: MeasurementKey
+    """The baseline."""
 
-    after: Key
-    """The line that is compared."""
+    after: MeasurementKey
+    """The row that is compared with the baseline."""
 
     queries: int
-    """How many both localized, or tried to."""
+    """Number of common queries."""
 
     add_before: float
-    """ADD-0.1d of the one in percent."""
+    """ADD-0.1d of the baseline, in percent."""
 
     add_after: float
-    """ADD-0.1d of the other in percent."""
+    """ADD-0.1d of the other row, in percent."""
 
     add_gain: Interval
     """95 % interval of the difference, in percentage points; negative is a loss."""
@@ -45,16 +45,16 @@ class Comparison:
     """Probability of such a difference if both are equally good."""
 
     faster: float
-    """Time of matching and pose of the one over that of the other."""
+    """Speedup: time of matching and pose estimation of the baseline, divided by that of the other row."""
 
     faster_between: Interval
-    """95 % interval of that."""
+    """95 % interval of the speedup."""
 
     smaller: float
-    """Size of the map of the one over that of the other."""
+    """Size of the map of the baseline, divided by that of the other row."""
 
     def to_json(self) -> dict:
-        """As plain values."""
+        """Plain values by their names in `results.json`."""
         names = ("method", "strategy", "variant")
         return {
             "object": self.object,
@@ -73,12 +73,12 @@ class Comparison:
         }
 
 
-def compare_cells(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Comparison:
-    """Compare two lines over one or several objects.
+def compare_measurements(name: str, pairs: Sequence[tuple[Measurement, Measurement]]) -> Comparison:
+    """Compare two rows over one or several objects.
 
     Args:
-        name: Of the object, or of all.
-        pairs: For each object the cell that is compared with, and the one that is compared, of equal queries.
+        name: Name of the object, or of the average.
+        pairs: For each object, the baseline and the other measurement, of the same queries.
     """
     groups = [np.column_stack([_values(before), _values(after)]) for before, after in pairs]
     weights = np.array([len(group) for group in groups]) / sum(len(group) for group in groups)
@@ -101,75 +101,136 @@ def compare_cells(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Comparison:
         p_value=paired_p_value(values[:, 2], values[:, 0]),
         faster=time_before / time_after,
         faster_between=faster,
-        smaller=_bytes([one for one, _ in pairs]) / _bytes([one for _, one in pairs]),
+        smaller=_map_bytes([one for one, _ in pairs]) / _map_bytes([one for _, one in pairs]),
     )
 
 
-def _values(cell: Cell) -> Float64[np.ndarray, "queries 2"]:
-    """Whether each query is right, and its time of matching and pose."""
-    outcomes = cell.outcomes
+def _values(one: Measurement) -> Float64[np.ndarray, "queries 2"]:
+    """Per query: whether the pose is correct, and the time of matching and pose estimation."""
+    outcomes = one.outcomes
     right, seconds = outcomes.error < ADD_FRACTIONS[0], outcomes.seconds[:, 1:].sum(axis=1)
-    return np.column_stack([per_query(cell, right), per_query(cell, seconds)])
+    return np.column_stack([mean_over_draws(one, right), mean_over_draws(one, seconds)])
 
 
-def _bytes(cells: Sequence[Cell]) -> float:
-    return float(np.mean([np.mean([trial.map_bytes for trial in cell.trials]) for cell in cells]))
+def _map_bytes(some: Sequence[Measurement]) -> float:
+    return float(np.mean([np.mean([run.map_bytes for run in one.map_runs]) for one in some]))
 
 
 def against_full(results: Sequence[ObjectResult]) -> list[Comparison]:
-    """Every line against the full map of the same method and strategy, of each object and over all.
+    """Compare every row with the full map of the same method and strategy, per object and over all objects.
 
-    Points for direct matching stand against the full map matched exhaustively, where that was done: it is
-    what they take the place of.
+    Maps for direct matching are compared with exhaustive matching against the full map if that was measured,
+    because they replace it.
     """
     found = [
-        (result.name, before, cell)
+        (result.name, before, one)
         for result in results
-        for cell in result.cells
-        if (before := _counterpart(result, cell))
+        for one in result.measurements
+        if (before := _baseline(result, one))
     ]
     return _compare_all(found)
 
 
 def compare_runs(before: Run, after: Run) -> list[Comparison]:
-    """Every line that two runs have in common, on the objects whose queries are the same.
+    """Compare the rows that two runs share, on the objects with the same queries.
 
     Raises:
-        InputError: They have nothing in common.
+        InputError: The runs share no row.
     """
     known = {one.name: one for one in before.objects}
     found = [
-        (one.name, old, cell)
+        (one.name, old, new)
         for one in after.objects
-        if one.name in known and _names(known[one.name]) == _names(one)
-        for cell in one.cells
-        if (old := known[one.name].cell(*cell.key))
+        if one.name in known and _query_names(known[one.name]) == _query_names(one)
+        for new in one.measurements
+        if (old := known[one.name].measurement(*new.key))
     ]
     if not found:
         raise InputError(
-            f"{before.folder} and {after.folder}: have no object with the same queries and no line in common"
+            f"{before.folder} and {after.folder}: the runs have no row in common on an object with the same "
+            "queries"
         )
     return _compare_all(found)
 
 
-def _names(result: ObjectResult) -> list[str]:
+def _query_names(result: ObjectResult) -> list[str]:
     return [query.path.name for query in result.queries]
 
 
-def _compare_all(found: Sequence[tuple[str, Cell, Cell]]) -> list[Comparison]:
-    """Over all objects first, where there are several, then of each."""
-    by_line: dict[tuple[Key, Key], list[tuple[Cell, Cell]]] = {}
+def _compare_all(found: Sequence[tuple[str, Measurement, Measurement]]) -> list[Comparison]:
+    """Over all objects first if there are several, then per object."""
+    by_row: dict[tuple[MeasurementKey, MeasurementKey], list[tuple[Measurement, Measurement]]] = {}
     for _, before, after in found:
-        by_line.setdefault((before.key, after.key), []).append((before, after))
-    overall = [compare_cells(BY_FRAME, pairs) for pairs in by_line.values() if len(pairs) > 1]
-    return overall + [compare_cells(name, [(before, after)]) for name, before, after in found]
+        by_row.setdefault((before.key, after.key), []).append((before, after))
+    overall = [compare_measurements(BY_FRAME, pairs) for pairs in by_row.values() if len(pairs) > 1]
+    return overall + [compare_measurements(name, [(before, after)]) for name, before, after in found]
 
 
-def _counterpart(result: ObjectResult, cell: Cell) -> Cell | None:
-    if cell.variant == "full":
+def _baseline(result: ObjectResult, one: Measurement) -> Measurement | None:
+    if one.variant == "full":
         return None
-    strategies = [cell.strategy]
-    if cell.variant == "default" or cell.variant.startswith("points"):
-        strategies = ["exhaustive", cell.strategy]
-    known = (result.cell(cell.method, strategy, "full") for strategy in strategies)
-    return next((one for one in known if one), None)
+    strategies = [one.strategy]
+    if one.variant == "default" or one.variant.startswith("points"):
+        strategies = ["exhaustive", one.strategy]
+    known = (result.measurement(one.method, strategy, "full") for strategy in strategies)
+    return next((found for found in known if found), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DominationSummary:
+    """Sizes of the dominating sets of one method over all objects."""
+
+    method: str
+    """Name of the method."""
+
+    objects: int
+    """Number of objects."""
+
+    smallest: int
+    """Number of images in the smallest set."""
+
+    mean: float
+    """Mean number of images in a set."""
+
+    largest: int
+    """Number of images in the largest set."""
+
+    images_kept_mean: float
+    """Share of the reference images that the set keeps, mean over objects."""
+
+    images_kept_median: float
+    """Share of the reference images that the set keeps, median over objects."""
+
+    points_kept_mean: float
+    """Share of the points that the set keeps, mean over objects."""
+
+    points_kept_median: float
+    """Share of the points that the set keeps, median over objects."""
+
+    def to_json(self) -> dict:
+        """Plain values by their names in `results.json`."""
+        return asdict(self)
+
+
+def summarize_domination(results: Sequence[ObjectResult]) -> list[DominationSummary]:
+    """Sizes of the dominating sets, one summary per method: the figures in the paper's text."""
+    methods = dict.fromkeys(one.method for result in results for one in result.maps)
+    return [_summary(method, results) for method in methods]
+
+
+def _summary(method: str, results: Sequence[ObjectResult]) -> DominationSummary:
+    maps = [one for result in results for one in result.maps if one.method == method]
+    sizes = np.array([len(one.dominating_set) for one in maps])
+    images = sizes / [one.references for one in maps]
+    points = np.array([one.dominating_points / one.points for one in maps])
+    return DominationSummary(
+        method=method,
+        objects=len(maps),
+        smallest=int(sizes.min()),
+        mean=float(sizes.mean()),
+        largest=int(sizes.max()),
+        images_kept_mean=float(images.mean()),
+        images_kept_median=float(np.median(images)),
+        points_kept_mean=float(points.mean()),
+        points_kept_median=float(np.median(points)),
+    )

@@ -1,33 +1,26 @@
-"""The table as text: Markdown, LaTeX and CSV."""
+"""The results of a run as text: Markdown, LaTeX and CSV."""
 
 import csv
 import io
 from collections.abc import Sequence
 from itertools import groupby
 
-from slimsfm.evaluation.columns import STAGES, Column, paper_columns
-from slimsfm.evaluation.comparison import Comparison
+from slimsfm.evaluation.comparison import Comparison, DominationSummary, summarize_domination
 from slimsfm.evaluation.results import ObjectResult, Run
-from slimsfm.evaluation.summary import DominationSummary, summarize_domination
-from slimsfm.evaluation.table import Row, average_rows, rows_of
+from slimsfm.evaluation.table import STAGE_COLUMNS, Column, Row, is_metric, paper_columns
 
 _LABELS = ("Object", "Method", "Strategy", "Map")
 _NOTHING = "\N{EN DASH}"
 _TIMES = "\N{MULTIPLICATION SIGN}"
 
 
-def is_metric(rows: Sequence[Row]) -> bool:
-    """Whether some row is in centimetres."""
-    return any(row.scores.deg_cm is not None for row in rows)
-
-
-def labels(row: Row) -> tuple[str, str, str, str]:
-    """What a row is about."""
+def row_labels(row: Row) -> tuple[str, str, str, str]:
+    """Object, method, strategy and variant of a row."""
     return row.object, row.method, row.strategy, row.variant
 
 
-def shown(row: Row, column: Column, *, interval: bool = False) -> str:
-    """A value as it is written, with its 95 % interval if wanted; a dash where there is none."""
+def format_value(row: Row, column: Column, *, interval: bool = False) -> str:
+    """A value of a row as text, with its 95 % interval on request; a dash if there is no value."""
     values = row.to_json()
     value = values.get(column.key)
     if value is None:
@@ -39,23 +32,26 @@ def shown(row: Row, column: Column, *, interval: bool = False) -> str:
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
-    """The paper's columns with 95 % intervals of ADD-0.1d, and the times of the stages."""
-    shown_columns = (*paper_columns(metric=is_metric(rows)), *STAGES)
+    """Markdown table: the paper's columns with 95 % intervals of ADD-0.1d, and the time of each stage."""
+    shown_columns = (*paper_columns(metric=is_metric(rows)), *STAGE_COLUMNS)
     header = [*_LABELS, *(column.title for column in shown_columns)]
     rule = [*("---" for _ in _LABELS), *("---:" for _ in shown_columns)]
     lines = [
-        [*labels(row), *(shown(row, column, interval=column.key == "add_0.1d") for column in shown_columns)]
+        [
+            *row_labels(row),
+            *(format_value(row, column, interval=column.key == "add_0.1d") for column in shown_columns),
+        ]
         for row in rows
     ]
     return _markdown(header, rule, *lines)
 
 
 def markdown_comparisons(comparisons: Sequence[Comparison]) -> str:
-    """What lines gain and lose against others."""
+    """Markdown table of what rows gain and lose against their baselines."""
     header = [
         "Object",
-        "Line",
-        "against",
+        "Row",
+        "Baseline",
         "ADD-0.1d",
         "95 % interval of the difference",
         "p",
@@ -70,7 +66,7 @@ def markdown_comparisons(comparisons: Sequence[Comparison]) -> str:
             ", ".join(one.before),
             f"{one.add_before:.1f} → {one.add_after:.1f}",
             f"{one.add_gain.low:+.1f} to {one.add_gain.high:+.1f}",
-            p_value(one.p_value),
+            format_p_value(one.p_value),
             f"{one.faster:.1f}{_TIMES} ({one.faster_between.low:.1f} to {one.faster_between.high:.1f})",
             f"{one.smaller:.1f}{_TIMES}",
         ]
@@ -84,13 +80,13 @@ def _markdown(*lines: Sequence[str]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in cells)
 
 
-def p_value(value: float) -> str:
-    """A probability as it is written."""
+def format_p_value(value: float) -> str:
+    """A probability with three digits; small ones are not rounded to 0."""
     return f"{value:.3f}" if value >= 0.001 else "< 0.001"
 
 
 def markdown_summaries(summaries: Sequence[DominationSummary]) -> str:
-    """Sizes of dominating sets."""
+    """Markdown table of the sizes of dominating sets."""
     kept = "Images kept, mean | median | Points kept, mean | median"
     header = f"| Method | Objects | Images, min | mean | max | {kept} |\n|---|{'---:|' * 8}\n"
     lines = [
@@ -103,10 +99,10 @@ def markdown_summaries(summaries: Sequence[DominationSummary]) -> str:
 
 
 def latex_table(rows: Sequence[Row], caption: str) -> str:
-    """The paper's table for LaTeX's package booktabs; a rule parts objects, methods and strategies."""
+    """The paper's table in LaTeX (booktabs), with rules between objects, methods and strategies."""
     shown_columns = paper_columns(metric=is_metric(rows))
     header = " & ".join(["Method", *(_latex(column.title) for column in shown_columns)])
-    groups = [list(group) for _, group in groupby(rows, key=lambda row: labels(row)[:3])]
+    groups = [list(group) for _, group in groupby(rows, key=lambda row: row_labels(row)[:3])]
     lines = " \\\\\n    \\midrule\n".join(
         " \\\\\n".join("    " + _latex_line(row, shown_columns) for row in group) for group in groups
     )
@@ -127,7 +123,7 @@ def latex_table(rows: Sequence[Row], caption: str) -> str:
 def _latex_line(row: Row, shown_columns: Sequence[Column]) -> str:
     name = f"{row.object}: {row.method}, {row.strategy}"
     cells = [name if row.variant == "full" else f"{name} [{row.variant}]"]
-    cells += [shown(row, column) for column in shown_columns]
+    cells += [format_value(row, column) for column in shown_columns]
     return " & ".join(_latex(cell) for cell in cells)
 
 
@@ -143,31 +139,31 @@ _LATEX = str.maketrans(
 
 
 def csv_table(rows: Sequence[Row]) -> str:
-    """Every value of every row."""
+    """CSV of every value of every row."""
     values = [row.to_json() for row in rows]
     return _csv(list(dict.fromkeys(key for one in values for key in one)), values)
 
 
 def csv_queries(results: Sequence[ObjectResult]) -> str:
-    """Every query of every line: what other statistics can be computed from."""
+    """CSV of every query of every row, as input for other statistics."""
     values = [
         {
             "object": result.name,
-            "method": cell.method,
-            "strategy": cell.strategy,
-            "variant": cell.variant,
+            "method": measurement.method,
+            "strategy": measurement.strategy,
+            "variant": measurement.variant,
             "draw": draw,
             "query": query.path.name,
-            "error": trial.outcomes.error[i],
-            "rotation_deg": trial.outcomes.rotation_deg[i],
-            "translation": trial.outcomes.translation[i],
-            "confidence": trial.outcomes.confidence[i],
-            "references_tried": trial.outcomes.references[i],
-            **dict(zip(("s_extract", "s_match", "s_pose"), trial.outcomes.seconds[i], strict=True)),
+            "error": run.outcomes.error[i],
+            "rotation_deg": run.outcomes.rotation_deg[i],
+            "translation": run.outcomes.translation[i],
+            "confidence": run.outcomes.confidence[i],
+            "references_tried": run.outcomes.references[i],
+            **dict(zip(("s_extract", "s_match", "s_pose"), run.outcomes.seconds[i], strict=True)),
         }
         for result in results
-        for cell in result.cells
-        for draw, trial in enumerate(cell.trials)
+        for measurement in result.measurements
+        for draw, run in enumerate(measurement.map_runs)
         for i, query in enumerate(result.queries)
     ]
     return _csv(list(values[0]) if values else [], values)
@@ -182,9 +178,9 @@ def _csv(header: list[str], values: list[dict]) -> str:
 
 
 def markdown_page(run: Run, rows: Sequence[Row], comparisons: Sequence[Comparison]) -> str:
-    """All of a run on one page."""
+    """A Markdown page with the tables of a run and its environment."""
     made = "\n".join(f"- {key}: {value}" for key, value in run.environment.items())
-    failed = "".join(f"\n**{name} could not be measured**: {why}\n" for name, why in run.failed.items())
+    failed = "".join(f"\n**{name} failed**: {why}\n" for name, why in run.failed.items())
     return f"""# {run.dataset}
 {failed}
 {markdown_table(rows)}
@@ -193,8 +189,8 @@ Accuracy in % of queries, with 95 % bootstrap intervals over queries; d is the d
 ## Against the full map
 
 {markdown_comparisons(comparisons)}
-p: of such a difference between equally good maps, by sign flips of the queries' differences. Faster: matching
-and pose, without extraction.
+p: probability of such a difference between equally good maps, by sign flips of the differences per query.
+Faster: matching and pose estimation, without extraction.
 
 ## Dominating sets
 
@@ -203,8 +199,3 @@ and pose, without extraction.
 
 {made}
 """
-
-
-def all_rows(run: Run) -> list[Row]:
-    """Of every object, and the averages."""
-    return [*average_rows(run.objects), *(row for one in run.objects for row in rows_of(one))]

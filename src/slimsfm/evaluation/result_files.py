@@ -1,13 +1,13 @@
-"""Results of benchmarks on disk: one JSON file an object, and one for the whole run.
+"""Results on disk: one JSON file per object, and the results and tables of the whole run.
 
-A pose is seven numbers, the quaternion x y z w of its rotation and its translation, so that what is read is
-to the bit what was written.
+A pose is stored as seven numbers, the quaternion x y z w of its rotation and its translation, so that reading
+returns the written values bit for bit.
 """
 
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,39 @@ import numpy as np
 import pycolmap
 
 from slimsfm.errors import InputError
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.protocol import Query
-from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Run, Trial
+from slimsfm.evaluation.comparison import (
+    Comparison,
+    DominationSummary,
+    against_full,
+    summarize_domination,
+)
+from slimsfm.evaluation.formats import csv_queries, csv_table, latex_table, markdown_page
+from slimsfm.evaluation.results import (
+    MappedObject,
+    MapRun,
+    Measurement,
+    ObjectResult,
+    Outcomes,
+    PosedQuery,
+    Run,
+)
+from slimsfm.evaluation.table import Row, all_rows
 from slimsfm.files import replacing
 from slimsfm.geometry import Box
 
-FORMAT_VERSION = 1
+RESULT_FORMAT_VERSION = 1
 
 _DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError)
 
 
 def write_json(path: Path, data: dict) -> None:
-    """Write a JSON file, replacing what stood there; no number may be infinite, and paths become text."""
+    """Write a JSON file, replacing an existing one; numbers must be finite, and paths become text."""
     with replacing(path, overwrite=True) as partial:
         partial.write_text(json.dumps(data, indent=1, allow_nan=False, default=str) + "\n", encoding="utf-8")
 
 
 def object_to_json(result: ObjectResult) -> dict:
-    """The result of an object as plain values."""
+    """The results of an object as plain values."""
     return {
         "name": result.name,
         "box": {"center": result.box.center.tolist(), "half_edges": result.box.half_edges.tolist()},
@@ -43,21 +57,21 @@ def object_to_json(result: ObjectResult) -> dict:
         "maps": [asdict(one) for one in result.maps],
         "cells": [
             {
-                "method": cell.method,
-                "strategy": cell.strategy,
-                "variant": cell.variant,
-                "trials": [_trial_to_json(trial) for trial in cell.trials],
+                "method": one.method,
+                "strategy": one.strategy,
+                "variant": one.variant,
+                "trials": [_map_run_to_json(run) for run in one.map_runs],
             }
-            for cell in result.cells
+            for one in result.measurements
         ],
     }
 
 
 def object_from_json(data: dict) -> ObjectResult:
-    """The result of an object, from plain values.
+    """The results of an object, from plain values.
 
     Raises:
-        ValueError: There is not one outcome a query.
+        ValueError: The number of outcomes differs from the number of queries.
     """
     found = ObjectResult(
         name=data["name"],
@@ -68,23 +82,23 @@ def object_from_json(data: dict) -> ObjectResult:
         maps=tuple(
             MappedObject(**{**one, "dominating_set": tuple(one["dominating_set"])}) for one in data["maps"]
         ),
-        cells=tuple(
-            Cell(
-                method=cell["method"],
-                strategy=cell["strategy"],
-                variant=cell["variant"],
-                trials=tuple(_trial_from_json(trial) for trial in cell["trials"]),
+        measurements=tuple(
+            Measurement(
+                method=one["method"],
+                strategy=one["strategy"],
+                variant=one["variant"],
+                map_runs=tuple(_map_run_from_json(run) for run in one["trials"]),
             )
-            for cell in data["cells"]
+            for one in data["cells"]
         ),
     )
-    counts = {len(trial.outcomes) for cell in found.cells for trial in cell.trials}
+    counts = {len(run.outcomes) for one in found.measurements for run in one.map_runs}
     if counts - {len(found.queries)}:
-        raise ValueError(f"there are {len(found.queries)} queries, but outcomes of {sorted(counts)}")
+        raise ValueError(f"{len(found.queries)} queries, but {sorted(counts)} outcomes")
     return found
 
 
-def _query_to_json(query: Query) -> dict:
+def _query_to_json(query: PosedQuery) -> dict:
     camera = query.camera
     return {
         "path": str(query.path),
@@ -98,20 +112,20 @@ def _query_to_json(query: Query) -> dict:
     }
 
 
-def _query_from_json(data: dict) -> Query:
-    return Query(
+def _query_from_json(data: dict) -> PosedQuery:
+    return PosedQuery(
         path=Path(data["path"]),
         camera=pycolmap.Camera(**data["camera"]),
         cam_from_world=_pose_from_json(data["cam_from_world"]),
     )
 
 
-def _trial_to_json(trial: Trial) -> dict:
-    outcomes = trial.outcomes
+def _map_run_to_json(run: MapRun) -> dict:
+    outcomes = run.outcomes
     return {
-        "references": trial.references,
-        "points": trial.points,
-        "map_bytes": trial.map_bytes,
+        "references": run.references,
+        "points": run.points,
+        "map_bytes": run.map_bytes,
         "error": _finite(outcomes.error),
         "rotation_deg": _finite(outcomes.rotation_deg),
         "translation": _finite(outcomes.translation),
@@ -122,8 +136,8 @@ def _trial_to_json(trial: Trial) -> dict:
     }
 
 
-def _trial_from_json(data: dict) -> Trial:
-    return Trial(
+def _map_run_from_json(data: dict) -> MapRun:
+    return MapRun(
         references=data["references"],
         points=data["points"],
         map_bytes=data["map_bytes"],
@@ -159,22 +173,22 @@ def _numbers(values: Sequence[float | None], missing: float) -> np.ndarray:
 
 
 def digest_of(objects: Sequence[ObjectResult]) -> str:
-    """Equal for runs that found the same poses with the same maps, whatever time it took and where."""
-    data = [_without_time(object_to_json(one)) for one in objects]
+    """Digest of maps and poses; it ignores times, paths and folders."""
+    data = [_comparable(object_to_json(one)) for one in objects]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _without_time(value: Any) -> Any:
+def _comparable(value: Any) -> Any:
     if isinstance(value, dict):
-        left_out = ("seconds", "images", "path")
-        return {key: _without_time(one) for key, one in value.items() if key not in left_out}
-    return [_without_time(one) for one in value] if isinstance(value, list) else value
+        ignored = ("seconds", "images", "path")
+        return {key: _comparable(one) for key, one in value.items() if key not in ignored}
+    return [_comparable(one) for one in value] if isinstance(value, list) else value
 
 
 def run_to_json(run: Run) -> dict:
-    """What a run measured, as plain values; `read_run` reads it back."""
+    """The results of a run as plain values; `read_run` reads them."""
     return {
-        "format": FORMAT_VERSION,
+        "format": RESULT_FORMAT_VERSION,
         "digest": digest_of(run.objects),
         "dataset": run.dataset,
         "options": run.options,
@@ -185,16 +199,16 @@ def run_to_json(run: Run) -> dict:
 
 
 def read_object_result(path: Path) -> ObjectResult:
-    """Read the result of an object that is done.
+    """Read the results of a finished object.
 
     Raises:
-        InputError: It is damaged.
+        InputError: The file is damaged.
     """
     try:
         return object_from_json(json.loads(path.read_text(encoding="utf-8")))
     except _DAMAGED as error:
         raise InputError(
-            f"{path}: is no result of slimsfm benchmark ({error!r}); delete it and run it again"
+            f"{path}: not a result of slimsfm benchmark ({error!r}); delete it and run the benchmark again"
         ) from error
 
 
@@ -202,19 +216,20 @@ def read_run(folder: Path) -> Run:
     """Read a run.
 
     Args:
-        folder: Its folder, or the results.json in it.
+        folder: The folder of the run, or its results.json.
 
     Raises:
-        InputError: There is no result, or it is damaged.
+        InputError: The results are missing or damaged.
     """
     path = folder if folder.suffix == ".json" else folder / "results.json"
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give the folder of a run of slimsfm benchmark")
+        raise InputError(f"{path}: no such file; pass the folder of a run of slimsfm benchmark")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        if data["format"] != FORMAT_VERSION:
+        if data["format"] != RESULT_FORMAT_VERSION:
             raise InputError(
-                f"{path}: is of format {data['format']}, this reads {FORMAT_VERSION}; run it again"
+                f"{path}: has format {data['format']}, expected {RESULT_FORMAT_VERSION}; "
+                "run the benchmark again"
             )
         return Run(
             folder=path.parent,
@@ -225,4 +240,47 @@ def read_run(folder: Path) -> Run:
             failed=data["failed"],
         )
     except _DAMAGED as error:
-        raise InputError(f"{path}: is no result of slimsfm benchmark ({error!r}); run it again") from error
+        raise InputError(
+            f"{path}: not a result of slimsfm benchmark ({error!r}); run the benchmark again"
+        ) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """What the tables of a run show."""
+
+    rows: tuple[Row, ...]
+    """Rows of the table: averages first, then per object."""
+
+    comparisons: tuple[Comparison, ...]
+    """Comparison of every row with the full map."""
+
+    dominating_sets: tuple[DominationSummary, ...]
+    """Sizes of the dominating sets, per method."""
+
+
+def write_results(run: Run) -> RunSummary:
+    """Write results.json, the table as Markdown, LaTeX and CSV, and queries.csv into the folder of a run.
+
+    Existing files are replaced.
+    """
+    rows, comparisons = all_rows(run), against_full(run.objects)
+    dominating_sets = summarize_domination(run.objects)
+    texts = {
+        "table.md": markdown_page(run, rows, comparisons),
+        "table.tex": latex_table(rows, run.dataset),
+        "table.csv": csv_table(rows),
+        "queries.csv": csv_queries(run.objects),
+    }
+    for name, text in texts.items():
+        with replacing(run.folder / name, overwrite=True) as partial:
+            partial.write_text(text, encoding="utf-8")
+    data = run_to_json(run) | {
+        "rows": [row.to_json() for row in rows],
+        "comparisons": [one.to_json() for one in comparisons],
+        "dominating_sets": [one.to_json() for one in dominating_sets],
+    }
+    write_json(run.folder / "results.json", data)
+    return RunSummary(
+        rows=tuple(rows), comparisons=tuple(comparisons), dominating_sets=tuple(dominating_sets)
+    )

@@ -1,72 +1,139 @@
-"""What a benchmark measured: objects, the maps that methods made of them, and trials on variants of these."""
+"""What a benchmark measures: outcomes of queries, maps of each object, one measurement per table row."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from slimsfm.evaluation.outcomes import Outcomes, join
-from slimsfm.evaluation.protocol import Query
+import numpy as np
+import pycolmap
+from jaxtyping import Float64, Int64
+
 from slimsfm.geometry import Box
+
+STAGES = ("extract", "match", "pose")
+"""Stages of localizing a query, in this order."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PosedQuery:
+    """A query image with a known pose."""
+
+    path: Path
+    """The image file."""
+
+    camera: pycolmap.Camera
+    """Its intrinsics."""
+
+    cam_from_world: pycolmap.Rigid3d
+    """Its true pose in the frame of the map."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcomes:
+    """Results of localizing n queries; entry i of each field belongs to query i."""
+
+    error: Float64[np.ndarray, " n"]
+    """Error relative to the size of the object, see `PoseError.relative`; infinite without a pose."""
+
+    rotation_deg: Float64[np.ndarray, " n"]
+    """Rotation error; infinite without a pose."""
+
+    translation: Float64[np.ndarray, " n"]
+    """Translation error in map units; infinite without a pose."""
+
+    confidence: Float64[np.ndarray, " n"]
+    """Probability that the pose is correct; NaN without a pose."""
+
+    references: Int64[np.ndarray, " n"]
+    """Number of reference images that the query was matched with."""
+
+    seconds: Float64[np.ndarray, "n 3"]
+    """Time of each of `STAGES`."""
+
+    cam_from_world: tuple[pycolmap.Rigid3d | None, ...]
+    """The estimated poses."""
+
+    def __post_init__(self) -> None:
+        lengths = {name: len(values) for name, values in vars(self).items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"all fields must have the same number of queries, got {lengths}")
+
+    def __len__(self) -> int:
+        return len(self.error)
+
+
+def join_outcomes(parts: Sequence[Outcomes]) -> Outcomes:
+    """Concatenate outcomes."""
+    return Outcomes(
+        error=np.concatenate([one.error for one in parts]),
+        rotation_deg=np.concatenate([one.rotation_deg for one in parts]),
+        translation=np.concatenate([one.translation for one in parts]),
+        confidence=np.concatenate([one.confidence for one in parts]),
+        references=np.concatenate([one.references for one in parts]),
+        seconds=np.concatenate([one.seconds for one in parts]),
+        cam_from_world=tuple(pose for one in parts for pose in one.cam_from_world),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class MappedObject:
-    """What a method made of an object's mapping sequence."""
+    """The full map of an object with one method, and its dominating set."""
 
     method: str
-    """The method: an extractor, or extractor+matcher."""
+    """Name of the method: EXTRACTOR or EXTRACTOR+MATCHER."""
 
     references: int
-    """Reference images of the full map."""
+    """Number of reference images in the full map."""
 
     points: int
-    """Points of the full map."""
+    """Number of points in the full map."""
 
     edges: int
-    """Of the reference graph, at the threshold."""
+    """Number of edges of the reference graph at the threshold."""
 
     dominating_set: tuple[str, ...]
-    """Names of its images."""
+    """Names of the images in the dominating set."""
 
     lower_bound: int
-    """No dominating set has fewer images."""
+    """Every dominating set has at least this many images."""
 
     dominating_points: int
-    """Points that images of the dominating set see."""
+    """Number of points that the images of the dominating set observe."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Trial:
+class MapRun:
     """All queries localized against one map."""
 
     references: int
-    """Reference images of the map."""
+    """Number of reference images in the map."""
 
     points: int
-    """Points of the map."""
+    """Number of points in the map."""
 
     map_bytes: int
     """Size of the map on disk."""
 
     outcomes: Outcomes
-    """What became of the queries."""
+    """Outcomes of the queries."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Cell:
-    """One strategy of one method on one variant of the map: a line of the table."""
+class Measurement:
+    """One method and strategy on one variant of the map: a row of the table."""
 
     method: str
-    """The method: an extractor, or extractor+matcher."""
+    """Name of the method: EXTRACTOR or EXTRACTOR+MATCHER."""
 
     strategy: str
-    """How queries were matched."""
+    """How queries are matched."""
 
     variant: str
-    """Which map."""
+    """Variant of the map, as spelled in the options."""
 
-    trials: tuple[Trial, ...]
-    """One, or several where chance plays a part in the map."""
+    map_runs: tuple[MapRun, ...]
+    """One run, or one per draw for random variants."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -75,81 +142,81 @@ class Cell:
 
     @cached_property
     def outcomes(self) -> Outcomes:
-        """Of all trials, one after the other."""
-        return join([trial.outcomes for trial in self.trials])
+        """Outcomes of all runs, concatenated."""
+        return join_outcomes([run.outcomes for run in self.map_runs])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectResult:
-    """What was measured on one object."""
+    """All measurements of one object."""
 
     name: str
-    """The object."""
+    """Name of the object."""
 
     box: Box
-    """Its box, in the frame of the poses."""
+    """Box of the object, in the frame of the poses."""
 
     unit: str
-    """Of that frame: "metre" or "unknown"."""
+    """Unit of that frame: "metre" or "unknown"."""
 
     images: Path
-    """Folder of the mapping images; names in maps are relative to it."""
+    """Folder of the mapping images; image names in maps are relative to it."""
 
-    queries: tuple[Query, ...]
+    queries: tuple[PosedQuery, ...]
     """The queries, in the order of all outcomes."""
 
     maps: tuple[MappedObject, ...]
-    """One a method."""
+    """One per method."""
 
-    cells: tuple[Cell, ...]
-    """Method by method, strategy by strategy."""
+    measurements: tuple[Measurement, ...]
+    """Sorted by method, then by strategy, in the order of the options."""
 
-    def cell(self, method: str, strategy: str, variant: str) -> Cell | None:
-        """The cell of this key, where it was measured."""
-        return next((one for one in self.cells if one.key == (method, strategy, variant)), None)
+    def measurement(self, method: str, strategy: str, variant: str) -> Measurement | None:
+        """The measurement with this key, or None if it does not exist."""
+        return next((one for one in self.measurements if one.key == (method, strategy, variant)), None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """A benchmark: what is in its folder.
+    """The results of a benchmark, stored in a folder.
 
-    FOLDER/results.json                           all of it
+    FOLDER/results.json                           all results
     FOLDER/table.md, table.tex, table.csv         the table
-    FOLDER/queries.csv                            every query of every line
-    FOLDER/objects/OBJECT.json                    an object that is done
-    FOLDER/truth/OBJECT/                          the model that poses were taken from
-    FOLDER/maps/OBJECT/METHOD/VARIANT             the maps: full, dominating, default; not random ones
+    FOLDER/queries.csv                            every query of every row
+    FOLDER/objects/OBJECT.json                    results of a finished object
+    FOLDER/truth/OBJECT/                          the model that provides the true poses
+    FOLDER/maps/OBJECT/METHOD/VARIANT             the maps, except random ones
     FOLDER/maps/OBJECT/METHOD/full/graph-*.npz    the reference graph
     """
 
     folder: Path
-    """Where it lies."""
+    """Folder of the run."""
 
     dataset: str
-    """What the data set is: its kind, and the name of its folder."""
+    """Kind of the data set and name of its folder."""
 
     options: dict
-    """What was asked for."""
+    """Options of the benchmark as plain values."""
 
     environment: dict[str, str]
-    """Versions and machine."""
+    """Software versions and the machine."""
 
     objects: tuple[ObjectResult, ...]
-    """Sorted by name."""
+    """Results of all objects, sorted by name."""
 
     failed: dict[str, str]
-    """Objects that could not be measured, and why."""
+    """Error message of each object that could not be measured."""
 
     def map_path(self, name: str, method: str, variant: str) -> Path:
-        """Where a map lies."""
+        """Folder of one map."""
         return map_path(self.folder, name, method, variant)
 
 
 def map_path(folder: Path, name: str, method: str, variant: str) -> Path:
-    """Where a run in a folder keeps a map."""
+    """Folder of one map of an object, inside the folder of a run."""
     return maps_path(folder, name) / method / variant.replace(":", "-")
 
 
 def maps_path(folder: Path, name: str) -> Path:
-    """Where a run in a folder keeps the maps of an object."""
+    """Folder of all maps of an object, inside the folder of a run."""
     return folder / "maps" / name

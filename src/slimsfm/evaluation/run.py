@@ -1,18 +1,22 @@
-"""A benchmark over all objects of a data set: object by object, resumable, on several processes if wanted."""
+"""Run a benchmark over all objects of a data set: resumable, and on several processes on request."""
 
 import json
 import logging
+import os
+import platform
+import shutil
+import subprocess
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from slimsfm.datasets.base import Dataset
 from slimsfm.errors import OutputError, SlimsfmError
-from slimsfm.evaluation.benchmark import Bench, benchmark_object
-from slimsfm.evaluation.environment import environment
+from slimsfm.evaluation.benchmark import BenchmarkSetup, benchmark_object
 from slimsfm.evaluation.result_files import (
-    FORMAT_VERSION,
+    RESULT_FORMAT_VERSION,
     object_to_json,
     read_object_result,
     write_json,
@@ -24,119 +28,124 @@ from slimsfm.progress import ProgressBar, silent
 
 _LOGGER = logging.getLogger(__name__)
 
+_PACKAGES = (
+    *("slimsfm", "numpy", "scipy", "pycolmap", "poselib", "opencv-python-headless"),
+    *("torch", "kornia", "transformers", "onnxruntime"),
+)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Task:
-    """One object to measure, wherever that is done."""
+    """One object to measure; sent to another process if there is one."""
 
     dataset: Dataset
     name: str
-    bench: Bench
+    setup: BenchmarkSetup
 
 
 def run_benchmark(
     dataset: Dataset,
-    bench: Bench,
+    setup: BenchmarkSetup,
     open_executor: OpenExecutor | None = None,
     progress: ProgressBar = silent,
     *,
     overwrite: bool = False,
 ) -> Run:
-    """Measure every object of a data set, and write what comes of it into the run's folder.
+    """Measure every object of a data set and write its results into the folder of the run.
 
-    An object that is done is kept there, so that the same call goes on where it was cut off, and gives the
-    same but for times. One that fails is told of, tried again by the next call, and holds up no other.
+    The results of finished objects stay in the folder. After an interruption the same call continues, and its
+    result is the same except for times. An object that fails does not stop the others; its error is in
+    `Run.failed`, and the next call tries it again.
 
     Args:
         dataset: The data set.
-        bench: The folder of the run, and what is compared.
-        open_executor: Where objects are measured; None: here, one after the other. Times are comparable only
-            where nothing else runs.
-        progress: Told of each object.
-        overwrite: Start anew where the folder holds a run of other options.
+        setup: Folder of the run and options.
+        open_executor: Opens the executor that measures objects; None measures them here, one after the other.
+            Times are comparable only if nothing else runs.
+        progress: Progress callback, called once per object.
+        overwrite: Start from scratch if the folder holds a run with other options.
 
     Raises:
-        OutputError: The folder holds a run of other options and `overwrite` is off, or something else.
-        InputError: The data set has no object, or the result of one that was done is damaged.
+        OutputError: The folder holds a run with other options and `overwrite` is off, or other files.
+        InputError: The data set has no object, or the results of a finished object are damaged.
     """
     names = dataset.names()
-    _claim(bench.folder, _asked(dataset, bench), overwrite=overwrite)
-    todo = [name for name in names if not object_path(bench.folder, name).exists()]
-    inner = replace(bench, progress=silent) if open_executor else bench
-    tasks = [_Task(dataset=dataset, name=name, bench=inner) for name in todo]
+    _claim(setup.folder, _description(dataset, setup), overwrite=overwrite)
+    todo = [name for name in names if not object_path(setup.folder, name).exists()]
+    inner = replace(setup, progress=silent) if open_executor else setup
+    tasks = [_Task(dataset=dataset, name=name, setup=inner) for name in todo]
     failed: dict[str, str] = {}
     with closing(run_tasks(_measure, tasks, open_executor)) as results:
         for _ in progress(tasks, "measure objects"):
             index, why = next(results)
             if why:
                 failed[todo[index]] = why
-    if len(list(bench.folder.iterdir())) == 1:  # nothing came of it but the note of what was asked
-        remove(bench.folder)
-    return _finished(dataset, bench, [name for name in names if name not in failed], failed)
+    if len(list(setup.folder.iterdir())) == 1:  # only run.json: no object was measured
+        remove(setup.folder)
+    return _finished(dataset, setup, [name for name in names if name not in failed], failed)
 
 
 def object_path(folder: Path, name: str) -> Path:
-    """Where a run in a folder keeps the result of an object."""
+    """File with the results of a finished object, inside the folder of a run."""
     return folder / "objects" / f"{name}.json"
 
 
 def _measure(task: _Task) -> str | None:
-    """Measure an object and write its result; returns why it could not be, and then leaves no map of it."""
+    """Measure an object and write its results. On failure, remove its maps and return the error message."""
     try:
-        sequences = task.dataset.load(task.name, task.bench.dataset_making(task.name))
-        result = benchmark_object(sequences, task.bench)
-        write_json(object_path(task.bench.folder, task.name), object_to_json(result))
+        sequences = task.dataset.load(task.name, task.setup.load_options(task.name))
+        result = benchmark_object(sequences, task.setup)
+        write_json(object_path(task.setup.folder, task.name), object_to_json(result))
     except OutputError:
-        raise  # the folder of the run is at fault, not the object
+        raise  # the folder of the run is the problem, not the object
     except SlimsfmError as error:
         why = str(error)
-    except Exception as error:  # whatever is broken in one object, the others go on
-        _LOGGER.exception("%s could not be measured", task.name)
+    except Exception as error:  # one broken object must not stop the others
+        _LOGGER.exception("%s failed", task.name)
         why = f"{type(error).__name__}: {error}"
     else:
         return None
-    remove(maps_path(task.bench.folder, task.name))  # what is mended may be what they were made of
+    remove(maps_path(task.setup.folder, task.name))  # a fix of the input may change them
     return why
 
 
-def _asked(dataset: Dataset, bench: Bench) -> dict:
-    """What a run is of: a folder holds results of one such."""
-    asked = {
-        "format": FORMAT_VERSION,
+def _description(dataset: Dataset, setup: BenchmarkSetup) -> dict:
+    """The content of run.json: a folder holds the results of one data set and set of options."""
+    described = {
+        "format": RESULT_FORMAT_VERSION,
         "dataset": {"kind": type(dataset).__name__, **asdict(dataset)},  # pyright: ignore[reportArgumentType]
-        "options": asdict(bench.options),
-        "build": asdict(bench.build),
+        "options": asdict(setup.options),
+        "build": asdict(setup.build),
     }
-    return json.loads(json.dumps(asked, default=str))
+    return json.loads(json.dumps(described, default=str))
 
 
-def _claim(folder: Path, asked: dict, *, overwrite: bool) -> None:
-    """Make the folder one of this run, unless it is that already.
+def _claim(folder: Path, description: dict, *, overwrite: bool) -> None:
+    """Write run.json into the folder, unless it already holds this run.
 
     Raises:
-        OutputError: It is of another run and `overwrite` is off, or it holds something else.
+        OutputError: The folder holds another run and `overwrite` is off, or other files.
     """
-    known = _read(folder / "run.json")
-    if known == asked:
+    known = _read_description(folder / "run.json")
+    if known == description:
         return
     if known is None and folder.exists() and not _is_empty(folder):
-        raise OutputError(f"{folder}: exists already and is no run; choose another output")
+        raise OutputError(f"{folder}: exists already and is not a run; choose another output")
     if known is not None:
         if not overwrite:
             raise OutputError(
-                f"{folder}: holds a run of other options; choose another output or pass --overwrite"
+                f"{folder}: holds a run with other options; choose another output or set overwrite"
             )
         remove(folder)
-    write_json(folder / "run.json", asked)
+    write_json(folder / "run.json", description)
 
 
 def _is_empty(folder: Path) -> bool:
-    """Whether it is a folder that holds nothing, but perhaps what a process that was killed left."""
+    """Whether it is a folder without files, except hidden ones that a killed process left."""
     return folder.is_dir() and all(path.name.startswith(".") for path in folder.iterdir())
 
 
-def _read(path: Path) -> dict | None:
-    """What a run was of; None where there is none."""
+def _read_description(path: Path) -> dict | None:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -144,12 +153,51 @@ def _read(path: Path) -> dict | None:
     return found if isinstance(found, dict) and "format" in found else None
 
 
-def _finished(dataset: Dataset, bench: Bench, names: Sequence[str], failed: dict[str, str]) -> Run:
+def _finished(dataset: Dataset, setup: BenchmarkSetup, names: Sequence[str], failed: dict[str, str]) -> Run:
     return Run(
-        folder=bench.folder,
+        folder=setup.folder,
         dataset=f"{type(dataset).__name__} {dataset.path.resolve().name}",
-        options={**asdict(bench.options), "build": asdict(bench.build)},
-        environment=environment(),
-        objects=tuple(read_object_result(object_path(bench.folder, name)) for name in names),
+        options={**asdict(setup.options), "build": asdict(setup.build)},
+        environment=describe_environment(),
+        objects=tuple(read_object_result(object_path(setup.folder, name)) for name in names),
         failed=failed,
     )
+
+
+def describe_environment() -> dict[str, str]:
+    """Versions of the installed packages that compute results, and the machine."""
+    found = {package: number for package in _PACKAGES if (number := _version(package))}
+    return {
+        **found,
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "cpu": _cpu(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "gpu": _gpu(),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _gpu() -> str:
+    """Names from nvidia-smi, because importing torch takes seconds."""
+    tool = shutil.which("nvidia-smi")
+    if tool is None:
+        return "none"
+    command = [tool, "--query-gpu=name", "--format=csv,noheader"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    return ", ".join(found.stdout.split("\n")[:-1]) or "none"

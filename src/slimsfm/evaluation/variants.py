@@ -1,6 +1,6 @@
 """The variants of a map that a benchmark compares.
 
-A variant is spelled as a name, or as a name and settings: `random:8`, `points:500`, `dominating:k=2,rim`.
+A variant is a name, or a name and settings: `random:8`, `points:500`, `dominating:k=2,rim`.
 """
 
 from collections.abc import Callable
@@ -35,40 +35,40 @@ _SELECTOR = "information"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Making:
-    """What variants of a map are made by."""
+class VariantInputs:
+    """What variants are made from."""
 
     map: Map
-    """The map."""
+    """The full map."""
 
     graph: ReferenceGraph
     """Its reference graph."""
 
     reduction: ReductionOptions
-    """How its dominating set is chosen where a variant does not say otherwise."""
+    """How to choose dominating sets; the settings of a variant override it."""
 
     solution: Solution
-    """That dominating set."""
+    """The dominating set for these options."""
 
     weigh: Weigh
-    """Tells the size of a map."""
+    """Returns the size of a map."""
 
     progress: ProgressBar = silent
-    """Told of long work."""
+    """Progress callback."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kind:
-    """A kind of variant."""
+class VariantKind:
+    """A kind of variant: how to read its settings and how to make its maps."""
 
     read: Callable[[list[str]], Any]
-    """Makes settings of the words behind the colon, with an error where they cannot be."""
+    """Parses the words after the colon; raises an error for invalid ones."""
 
-    make: Callable[[Making, Any], list[Map]]
-    """Makes its maps of settings: several where chance plays a part, none where the map does not allow it."""
+    make: Callable[[VariantInputs, Any], list[Map]]
+    """Makes the maps: several for random variants, none if the variant is not possible."""
 
     takes: str
-    """What it can be told."""
+    """Describes the settings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,29 +76,29 @@ class Variant:
     """A variant of a map."""
 
     name: str
-    """As it was spelled."""
+    """The variant as spelled in the options."""
 
     kind: str
-    """One of `VARIANTS`."""
+    """Key of `VARIANTS`."""
 
     settings: Any
-    """As the kind reads them."""
+    """Settings as the kind parses them."""
 
     @property
     def is_random(self) -> bool:
-        """Whether chance plays a part."""
+        """Whether its maps are drawn at random."""
         return self.kind == "random"
 
-    def make(self, making: Making) -> list[Map]:
-        """Its maps."""
-        return VARIANTS[self.kind].make(making, self.settings)
+    def make(self, inputs: VariantInputs) -> list[Map]:
+        """Make the maps of this variant."""
+        return VARIANTS[self.kind].make(inputs, self.settings)
 
 
 def parse_variant(text: str) -> Variant:
     """Read a variant.
 
     Raises:
-        ValueError: There is no such variant, or it takes no such setting.
+        ValueError: The variant or a setting of it is unknown.
     """
     kind, colon, rest = text.partition(":")
     if kind not in VARIANTS:
@@ -110,25 +110,25 @@ def parse_variant(text: str) -> Variant:
     return Variant(name=text, kind=kind, settings=settings)
 
 
-def _nothing(words: list[str]) -> None:
+def _no_settings(words: list[str]) -> None:
     if words:
         raise ValueError(f"{words[0]!r} is unknown")
 
 
-def _full(making: Making, _: None) -> list[Map]:
-    return [making.map]
+def _full(inputs: VariantInputs, _: None) -> list[Map]:
+    return [inputs.map]
 
 
 def _reduction_settings(words: list[str]) -> dict[str, Any]:
-    """Fields of `ReductionOptions` that differ."""
+    """The fields of `ReductionOptions` to override."""
     settings = {}
     for word in words:
         key, _, value = word.partition("=")
         field, read = _REDUCTION_WORDS[key]
         if field in settings:
-            raise ValueError(f"{key} is given twice")
+            raise ValueError(f"{key} is set twice")
         settings[field] = read(value)
-    ReductionOptions(**settings)  # refuses what cannot be
+    ReductionOptions(**settings)  # raises for invalid values
     return settings
 
 
@@ -148,14 +148,14 @@ _REDUCTION_WORDS: dict[str, tuple[str, Callable[[str], Any]]] = {
 }
 
 
-def _dominating(making: Making, settings: dict[str, Any]) -> list[Map]:
-    options = replace(making.reduction, **settings)
-    chosen = dominating_set(making.graph, options, making.map).chosen if settings else making.solution.chosen
-    return [keep_images(making.map, (making.graph.names[i] for i in chosen))]
+def _dominating(inputs: VariantInputs, settings: dict[str, Any]) -> list[Map]:
+    options = replace(inputs.reduction, **settings)
+    chosen = dominating_set(inputs.graph, options, inputs.map).chosen if settings else inputs.solution.chosen
+    return [keep_images(inputs.map, (inputs.graph.names[i] for i in chosen))]
 
 
 def _count(words: list[str]) -> int | None:
-    """The one setting, a positive number; None where there is none."""
+    """The only setting, a positive number; None without settings."""
     if not words:
         return None
     (word,) = words
@@ -164,19 +164,19 @@ def _count(words: list[str]) -> int | None:
     return int(word)
 
 
-def _random(making: Making, count: int | None) -> list[Map]:
-    count = count or len(making.solution.chosen)
-    if count > len(making.map.images):
+def _random(inputs: VariantInputs, count: int | None) -> list[Map]:
+    count = count or len(inputs.solution.chosen)
+    if count > len(inputs.map.images):
         return []
-    return [keep_random_images(making.map, count, seed=seed) for seed in range(_DRAWS)]
+    return [keep_random_images(inputs.map, count, seed=seed) for seed in range(_DRAWS)]
 
 
-def _default(making: Making, _: None) -> list[Map]:
-    if making.map.info.extractor in DETECTOR_FREE:
+def _default(inputs: VariantInputs, _: None) -> list[Map]:
+    if inputs.map.info.extractor in DETECTOR_FREE:
         return []
     options = FrontierOptions(uses=("direct",))
-    found = frontier(making.map, None, making.weigh, options, making.progress)
-    return [Maker(making.map).make(recommend(found, "direct").choice)]
+    found = frontier(inputs.map, None, inputs.weigh, options, inputs.progress)
+    return [Maker(inputs.map).make(recommend(found, "direct").choice)]
 
 
 def _points_settings(words: list[str]) -> tuple[int, str]:
@@ -187,27 +187,27 @@ def _points_settings(words: list[str]) -> tuple[int, str]:
     return _count([count]) or 0, selector
 
 
-def _points(making: Making, settings: tuple[int, str]) -> list[Map]:
-    if making.map.info.extractor in DETECTOR_FREE:
+def _points(inputs: VariantInputs, settings: tuple[int, str]) -> list[Map]:
+    if inputs.map.info.extractor in DETECTOR_FREE:
         return []
     count, selector = settings
-    problem = selection_problem(making.map, LeftOut(making.map), making.progress)
-    points = np.sort(SELECTORS[selector](problem, count, seed=making.reduction.seed))
+    problem = selection_problem(inputs.map, LeftOut(inputs.map), inputs.progress)
+    points = np.sort(SELECTORS[selector](problem, count, seed=inputs.reduction.seed))
     choice = Choice(use="direct", method=selector, detail=f"{count} points", images=(), points=points)
-    return [Maker(making.map).make(choice)]
+    return [Maker(inputs.map).make(choice)]
 
 
 VARIANTS = {
-    "full": Kind(read=_nothing, make=_full, takes="no settings"),
-    "dominating": Kind(
+    "full": VariantKind(read=_no_settings, make=_full, takes="no settings"),
+    "dominating": VariantKind(
         read=_reduction_settings,
         make=_dominating,
         takes="k=2, rim, budget=8, threshold=0.05, solver=random and cost=observations",
     ),
-    "default": Kind(read=_nothing, make=_default, takes="no settings"),
-    "random": Kind(read=_count, make=_random, takes="a number of images"),
-    "points": Kind(read=_points_settings, make=_points, takes="a number of points and a selector"),
+    "default": VariantKind(read=_no_settings, make=_default, takes="no settings"),
+    "random": VariantKind(read=_count, make=_random, takes="a number of images"),
+    "points": VariantKind(read=_points_settings, make=_points, takes="a number of points and a selector"),
 }
-"""What the names of variants stand for. `full` is all of the map, `dominating` a dominating set of its
-images, `random` as many images drawn five times, or the number given, `default` what `slimsfm reduce` gives
-by itself, and `points` so many points; the last two are for direct matching alone."""
+"""`full` is the full map, `dominating` a dominating set of its images, `random` as many random images, drawn
+five times, or the given number, `default` the default result of `slimsfm reduce`, and `points` the given
+number of points. `default` and `points` support only direct matching."""

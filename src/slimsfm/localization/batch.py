@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pycolmap
 
-from slimsfm.execution import num_cores, on_threads
+from slimsfm.execution import num_cores, map_on_threads
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
 from slimsfm.localization.multi import MultiLocalizer
@@ -91,7 +91,7 @@ def _localize(
     if workers is not None and workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
     tasks = _tasks(localizer, images, camera)
-    run = on_threads(partial(_localize_one, localizer, gravity), tasks, workers or num_cores())
+    run = map_on_threads(partial(_localize_one, localizer, gravity), tasks, workers or num_cores())
     strategies = {one.options.strategy_for(one.map) for one in localizer.localizers.values()}
     label = f"localize ({', '.join(sorted(strategies))})"
     by_image = {task.name: next(run) for task in progress(tasks, label)}

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from slimsfm.evaluation.columns import size
+from slimsfm.evaluation.table import format_bytes
 from slimsfm.reduction import Candidate, Frontier
 from slimsfm.report.figures import COLORS, INK, mark_logarithmic, new_figure, styled
 
@@ -39,7 +39,7 @@ def curves_figure(frontier: Frontier, recommended: Mapping[str, Candidate], full
         for axes in (losses, times):
             axes.axvline(full_bytes, color=INK, alpha=0.4, lw=1, ls=(0, (5, 4)), label="full map")
             axes.margins(x=0.08)
-            mark_logarithmic(axes.xaxis, size)
+            mark_logarithmic(axes.xaxis, format_bytes)
             axes.grid(visible=True)
         handles = losses.get_legend_handles_labels()[0]
         handles.append(Line2D([], [], label="recommended", **_RING))

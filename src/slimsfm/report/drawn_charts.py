@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from slimsfm.evaluation.comparison import Comparison
-from slimsfm.evaluation.outcomes import join
+from slimsfm.evaluation.results import join_outcomes
 from slimsfm.evaluation.table import BY_FRAME
 from slimsfm.report.charts import (
     frontier_chart,
@@ -25,8 +25,8 @@ def average_charts(story: Story, lines: Sequence[Comparison]) -> str:
     """Charts over all objects; `lines` are those that headlines are about."""
     figures = [frontier_chart(story.rows[BY_FRAME])]
     if lines:
-        cells = [cell for one in story.run.objects if (cell := one.cell(*lines[0].after))]
-        figures.append(reliability_chart(join([cell.outcomes for cell in cells])))
+        some = [found for one in story.run.objects if (found := one.measurement(*lines[0].after))]
+        figures.append(reliability_chart(join_outcomes([one.outcomes for one in some])))
     return _charts(figures)
 
 
@@ -35,11 +35,11 @@ def object_charts(opened: OpenedObject, story: Story, lines: Sequence[Comparison
     result = opened.result
     figures = [frontier_chart(story.rows[result.name])]
     if lines:
-        cells = [cell for key in (lines[0].before, lines[0].after) if (cell := result.cell(*key))]
-        before, after = (cell.trials[0].outcomes for cell in cells)
+        some = [one for key in (lines[0].before, lines[0].after) if (one := result.measurement(*key))]
+        before, after = (one.map_runs[0].outcomes for one in some)
         reduced = opened.maps.get("dominating", opened.maps["full"])
         places = reference_places(opened.maps["full"], reduced), query_places(result.queries, before, after)
-        figures += [sphere_chart(result.box, *places), reliability_chart(cells[1].outcomes)]
+        figures += [sphere_chart(result.box, *places), reliability_chart(some[1].outcomes)]
     return _charts(figures)
 
 

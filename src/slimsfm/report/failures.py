@@ -7,9 +7,8 @@ from html import escape
 import numpy as np
 
 from slimsfm.evaluation.comparison import Comparison
-from slimsfm.evaluation.metrics import SURE
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.results import ObjectResult
+from slimsfm.evaluation.results import ObjectResult, Outcomes
+from slimsfm.evaluation.scores import SURE
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.report.formatting import difference, line_name, percent_of_d, plural
 from slimsfm.report.report_data import Story
@@ -72,8 +71,8 @@ def changes(result: ObjectResult, line: Comparison) -> list[Change]:
 
     Of several draws of a map the first counts.
     """
-    cells = [result.cell(*key) for key in (line.before, line.after)]
-    before, after = (cell.trials[0].outcomes for cell in cells if cell)
+    some = [result.measurement(*key) for key in (line.before, line.after)]
+    before, after = (one.map_runs[0].outcomes for one in some if one)
     each = [
         Change(
             object=result.name,

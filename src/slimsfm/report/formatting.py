@@ -3,23 +3,23 @@
 from collections.abc import Sequence
 from math import isfinite
 
-from slimsfm.evaluation.columns import number, size
-from slimsfm.evaluation.comparison import Comparison, Key
-from slimsfm.evaluation.formats import p_value
+from slimsfm.evaluation.comparison import Comparison, MeasurementKey
+from slimsfm.evaluation.formats import format_p_value
 from slimsfm.evaluation.results import MappedObject
+from slimsfm.evaluation.table import format_bytes, format_number
 from slimsfm.mapping.map import Map
 
 __all__ = [
     "contents",
     "difference",
     "domination",
+    "format_bytes",
+    "format_number",
     "gain",
     "line_name",
-    "number",
     "percent_of_d",
     "plural",
     "ratio",
-    "size",
 ]
 
 _EQUAL = "1.0"
@@ -28,7 +28,7 @@ _EQUAL = "1.0"
 def plural(count: int, word: str) -> str:
     """A count and what it counts."""
     words = f"{word[:-1]}ies" if word.endswith("y") else f"{word}s"
-    return f"{number(count)} {word if count == 1 else words}"
+    return f"{format_number(count)} {word if count == 1 else words}"
 
 
 def contents(map: Map) -> str:
@@ -37,7 +37,7 @@ def contents(map: Map) -> str:
     return points if map.is_for_direct_matching else f"{plural(len(map.images), 'image')}, {points}"
 
 
-def line_name(key: Key, methods: Sequence[str] = ()) -> str:
+def line_name(key: MeasurementKey, methods: Sequence[str] = ()) -> str:
     """A line of the table: map and strategy, and where there are several methods which one."""
     method, strategy, variant = key
     name = f"{variant} map, {strategy}"
@@ -56,7 +56,7 @@ def difference(one: Comparison) -> str:
     """How sure the change in accuracy is: a 95 % interval, and the probability that it is chance."""
     return (
         f"difference {_signed(one.add_gain.low)} to {_signed(one.add_gain.high)} points, "
-        f"p {p_value(one.p_value)}"
+        f"p {format_p_value(one.p_value)}"
     )
 
 
@@ -80,8 +80,8 @@ def domination(mapped: MappedObject) -> str:
     count = len(mapped.dominating_set)
     least = "no fewer can" if mapped.lower_bound >= count else f"no fewer than {mapped.lower_bound} can"
     return (
-        f"{number(count)} of {plural(mapped.references, 'image')} dominate the others ({least}); they see "
-        f"{number(mapped.dominating_points)} of {plural(mapped.points, 'point')}."
+        f"{format_number(count)} of {plural(mapped.references, 'image')} dominate the others ({least}); "
+        f"they see {format_number(mapped.dominating_points)} of {plural(mapped.points, 'point')}."
     )
 
 

@@ -21,7 +21,7 @@ from slimsfm.geometry import corner_error
 from slimsfm.mapping.map import Map
 from slimsfm.photos import read_image, shrink
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.report.formatting import contents, number, size
+from slimsfm.report.formatting import contents, format_bytes, format_number
 from slimsfm.report.live_stage import BOX_RGB, DROPPED_RGB, KEPT_RGB, Stage
 
 MAX_PHOTO_PX = 320
@@ -172,7 +172,9 @@ class LiveView:
         return group
 
     def _add_switch(self) -> dict[str, viser.GuiButtonHandle]:
-        texts = {word: f"{contents(one.map)}, {size(one.num_bytes)}" for word, one in self.maps.items()}
+        texts = {
+            word: f"{contents(one.map)}, {format_bytes(one.num_bytes)}" for word, one in self.maps.items()
+        }
         if len(texts) == 1:
             self.server.gui.add_markdown(texts[BEFORE])
             return {}
@@ -200,7 +202,7 @@ class LiveView:
         shown = self.maps[self.shown].map
         if name in _images_to_match(shown):
             seen = np.unique(shown.observations[name].points)
-            self.told.content += f" sees {number(len(seen))} points"
+            self.told.content += f" sees {format_number(len(seen))} points"
 
 
 def _images_to_match(map: Map) -> set[str]:

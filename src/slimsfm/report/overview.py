@@ -3,14 +3,13 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from slimsfm.evaluation.comparison import Comparison
-from slimsfm.evaluation.formats import p_value
+from slimsfm.evaluation.comparison import Comparison, summarize_domination
+from slimsfm.evaluation.formats import format_p_value
 from slimsfm.evaluation.results import ObjectResult
-from slimsfm.evaluation.summary import summarize_domination
 from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row
 from slimsfm.report.drawn_charts import average_charts
 from slimsfm.report.failures import failures_html
-from slimsfm.report.formatting import difference, gain, line_name, number, plural, ratio, size
+from slimsfm.report.formatting import difference, format_bytes, format_number, gain, line_name, plural, ratio
 from slimsfm.report.report_data import Story
 from slimsfm.report.table import NOTHING, Head, Value, rows_html, table_html
 
@@ -61,7 +60,11 @@ def _tiles(story: Story, line: Comparison) -> str:
     interval = after.intervals["add_0.1d"]
     mean = " on average" * (len(story.run.objects) > 1)
     tiles = [
-        ("Size of the map", f"{size(before.map_bytes)} → {size(after.map_bytes)}", _smaller(line) + mean),
+        (
+            "Size of the map",
+            f"{format_bytes(before.map_bytes)} → {format_bytes(after.map_bytes)}",
+            _smaller(line) + mean,
+        ),
         (
             "Matching and pose",
             f"{_milliseconds(before)} → {_milliseconds(after)} ms",
@@ -139,7 +142,10 @@ def _object_line(story: Story, result: ObjectResult, anchor: str) -> list[str | 
     found = story.headlines(result.name)
     mapped = result.maps[0]
     counts = (mapped.references, len(mapped.dominating_set))
-    start = [f'<a href="#{anchor}">{escape(result.name)}</a>', *(Value(number(one), one) for one in counts)]
+    start = [
+        f'<a href="#{anchor}">{escape(result.name)}</a>',
+        *(Value(format_number(one), one) for one in counts),
+    ]
     if not found:
         return [*start, *([NOTHING] * (len(_OBJECT_HEADS) - len(start)))]
     line = found[0]
@@ -147,10 +153,10 @@ def _object_line(story: Story, result: ObjectResult, anchor: str) -> list[str | 
     interval = after.intervals["add_0.1d"]
     return [
         *start,
-        *(Value(size(row.map_bytes), row.map_bytes) for row in (before, after)),
+        *(Value(format_bytes(row.map_bytes), row.map_bytes) for row in (before, after)),
         Value(f"{line.add_before:.1f}", line.add_before),
         Value(f"{line.add_after:.1f}", line.add_after, f"{interval.low:.1f}\N{EN DASH}{interval.high:.1f}"),
-        Value(p_value(line.p_value), line.p_value),
+        Value(format_p_value(line.p_value), line.p_value),
         Value(f"{line.faster:.1f}", line.faster),
     ]
 

@@ -7,8 +7,7 @@ from jaxtyping import Float64
 
 from slimsfm.errors import ImageError
 from slimsfm.evaluation.comparison import Comparison
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.results import ObjectResult
+from slimsfm.evaluation.results import ObjectResult, Outcomes
 from slimsfm.photos import read_image
 from slimsfm.report.budget import Budget
 from slimsfm.report.formatting import line_name, percent_of_d
@@ -28,7 +27,7 @@ def worth_seeing(errors: Float64[np.ndarray, " n"], count: int) -> list[int]:
 def queries_html(result: ObjectResult, line: Comparison, budget: Budget) -> str:
     """Some queries with the object's box, as a slim map localizes them."""
     before, after = (
-        cell.trials[0].outcomes for key in (line.before, line.after) if (cell := result.cell(*key))
+        one.map_runs[0].outcomes for key in (line.before, line.after) if (one := result.measurement(*key))
     )
     shown = worth_seeing(after.error, budget.frames)
     frames = list(_frames(result, before, after, shown))

@@ -9,8 +9,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.results import ObjectResult
+from slimsfm.evaluation.results import ObjectResult, Outcomes
 from slimsfm.files import replacing
 from slimsfm.report.formatting import percent_of_d
 from slimsfm.report.frames import QueryFrame, draw_frame

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from slimsfm.evaluation.comparison import Comparison, Key, against_full
+from slimsfm.evaluation.comparison import Comparison, MeasurementKey, against_full
 from slimsfm.evaluation.results import ObjectResult, Run
 from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row, average_rows, rows_of
 
@@ -32,7 +32,7 @@ class Story:
     @property
     def methods(self) -> list[str]:
         """All methods."""
-        return list(dict.fromkeys(cell.method for one in self.run.objects for cell in one.cells))
+        return list(dict.fromkeys(line.method for one in self.run.objects for line in one.measurements))
 
     def of(self, name: str) -> list[Comparison]:
         """Every line of an object, or of all of them, against the full map."""
@@ -47,7 +47,7 @@ class Story:
         firsts = [next((one for one in found if one.after[2] == kind), None) for kind in _HEADLINES]
         return [one for one in firsts if one] or found[:1]
 
-    def row(self, name: str, key: Key) -> Row:
+    def row(self, name: str, key: MeasurementKey) -> Row:
         """The row of a line."""
         return next(row for row in self.rows[name] if (row.method, row.strategy, row.variant) == key)
 

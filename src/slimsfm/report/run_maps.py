@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options
-from slimsfm.evaluation.methods import parse_method
+from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options, parse_method
 from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.evaluation.variants import parse_variant
 from slimsfm.graph import ReferenceGraph
@@ -39,7 +38,7 @@ def open_object(run: Run, result: ObjectResult, method: str) -> OpenedObject:
     Raises:
         MapError: A map is missing or damaged.
     """
-    variants = [cell.variant for cell in result.cells if cell.method == method]
+    variants = [one.variant for one in result.measurements if one.method == method]
     kept = [one for one in dict.fromkeys(("full", *variants)) if not parse_variant(one).is_random]
     maps = {variant: read_map(run.map_path(result.name, method, variant)) for variant in kept}
     threshold = run.options["reduction"]["threshold"]

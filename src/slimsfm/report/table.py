@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from slimsfm.evaluation.columns import Column, columns
-from slimsfm.evaluation.comparison import Key
+from slimsfm.evaluation.comparison import MeasurementKey
 from slimsfm.evaluation.formats import is_metric
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.table import Column, Row, all_columns
 
 _MARKED = ' class="marked"'
 _MANY = 12  # rows, from which on a filter is worth its place
@@ -90,14 +89,14 @@ def _cell(cell: str | Value) -> str:
     return f'<td class="number"{value}>{escape(cell.text)}{aside}</td>'
 
 
-def rows_html(rows: Sequence[Row], marked: Sequence[Key] = ()) -> str:
+def rows_html(rows: Sequence[Row], marked: Sequence[MeasurementKey] = ()) -> str:
     """The paper's table, with 95 % intervals in small print; what has no value shows as a dash.
 
     Args:
         rows: Of one object, or of averages.
         marked: Lines that stand out.
     """
-    shown = columns(metric=is_metric(rows))
+    shown = all_columns(metric=is_metric(rows))
     texts = [(_STRATEGY, lambda row: row.strategy), (_VARIANT, lambda row: row.variant)]
     if len({row.method for row in rows}) > 1:
         texts.insert(0, (_METHOD, lambda row: row.method))

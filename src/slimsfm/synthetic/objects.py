@@ -1,4 +1,4 @@
-"""The objects: metric, textured, each hard for pose estimation in its own way."""
+"""The rendered objects: metric and textured, each with its own difficulty for pose estimation."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ def printed_box(seed: int) -> trimesh.Trimesh:
 
 
 def can(seed: int) -> trimesh.Trimesh:
-    """A cylinder with a label around it: only a part of the label is ever seen at once."""
+    """A cylinder with a label around it: each view shows only a part of the label."""
     rng, radius, height = np.random.default_rng([seed, 1]), 0.05, 0.14
     label = texture.page(rng, _texels(height), _texels(2 * np.pi * radius), cell=110)
     lids = [texture.tinted_noise(rng, 256, 256, (170, 172, 178), 0.5, cells=12) for _ in range(2)]
@@ -27,7 +27,7 @@ def can(seed: int) -> trimesh.Trimesh:
 
 
 def boulder(seed: int) -> trimesh.Trimesh:
-    """A rough stone: no plane, no print, its look is that of a noise in space."""
+    """A rough stone without planes or prints; its texture is 3D noise."""
     rng = np.random.default_rng([seed, 2])
     lattice = rng.random((32, 32, 32)).astype(np.float32)
     patches = []
@@ -39,7 +39,7 @@ def boulder(seed: int) -> trimesh.Trimesh:
 
 
 def tiled_box(seed: int) -> trimesh.Trimesh:
-    """A cube with one tile printed over and over, a small label on each side: most matches are ambiguous."""
+    """A cube with one repeated tile and a small label on each side: most matches are ambiguous."""
     rng, size = np.random.default_rng([seed, 3]), (0.15, 0.15, 0.15)
     side = _texels(size[0])
     tile = texture.page(rng, side // 5, side // 5, cell=40)
@@ -49,7 +49,7 @@ def tiled_box(seed: int) -> trimesh.Trimesh:
 
 
 def plain_box(seed: int) -> trimesh.Trimesh:
-    """A box of one colour with a label on each side: few features."""
+    """A box of one color with a label on each side: few features."""
     rng, size = np.random.default_rng([seed, 4]), (0.20, 0.14, 0.10)
     images = []
     for height, width in _faces(size):
@@ -59,7 +59,7 @@ def plain_box(seed: int) -> trimesh.Trimesh:
 
 
 def ball(seed: int) -> trimesh.Trimesh:
-    """A printed sphere: its shape tells nothing about its rotation, only its print does."""
+    """A printed sphere: only its print determines its rotation."""
     rng = np.random.default_rng([seed, 5])
     images = [texture.page(rng, 448, 448, cell=120) for _ in range(6)]
     sides = shapes.sphere_sides(25)
@@ -76,7 +76,7 @@ OBJECTS: dict[str, Callable[[int], trimesh.Trimesh]] = {
     "printed_box": printed_box,
     "tiled_box": tiled_box,
 }
-"""Each takes a seed of its print and gives a mesh in metres, z up, the centre of its box at the origin."""
+"""From a seed of the print to a mesh in meters, z up, with the center of its box at the origin."""
 
 
 def _texels(metres: float) -> int:

@@ -1,9 +1,9 @@
 """A ray caster for textured meshes: exact to a small fraction of a pixel, on the CPU, without OpenGL.
 
-Embree finds which triangle a pixel sees. Everything else follows in double precision from one fact: on a
-triangle with corners a, b, c in the camera's frame, the ray along d meets the point with barycentric weights
-proportional to (b x c)·d, (c x a)·d, (a x b)·d. So each attribute of a triangle is a ratio of two linear
-forms of d. How fast it changes from pixel to pixel follows too, and chooses the texture's level of detail.
+Embree finds the triangle that each pixel sees. The rest follows in double precision: on a triangle with
+corners a, b, c in the camera frame, the ray along d meets the point with barycentric weights proportional to
+(b x c)·d, (c x a)·d, (a x b)·d. So each attribute of a triangle is a ratio of two linear forms of d. Its
+derivative between pixels selects the level of detail of the texture.
 """
 
 from collections.abc import Sequence
@@ -23,31 +23,31 @@ from slimsfm.synthetic.texture import Picture
 Rgb = tuple[float, float, float]
 _SUBPIXELS = np.array([(-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)])
 _LEVELS = 13
-_BATCH = 16_000  # rays shaded at once: their arrays fit into the processor's cache
+_BATCH = 16_000  # rays shaded at once; their arrays fit into the CPU cache
 
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """One far lamp and light from everywhere; a matt surface sends back texture times their sum."""
+    """A distant lamp and ambient light; a matte surface reflects its texture times their sum."""
 
     towards: Rgb = (0.4, -0.5, 1.0)
-    """Direction to the lamp; of any length."""
+    """Direction to the lamp, of any length."""
 
     lamp: Rgb = (0.5, 0.5, 0.5)
     ambient: Rgb = (0.55, 0.55, 0.55)
     backdrop: Rgb = (150.0, 155.0, 160.0)
-    """What is seen where there is nothing, RGB in 0 to 255."""
+    """Color of the background, RGB from 0 to 255."""
 
 
 class Scene:
-    """Meshes under a light, made ready for rays."""
+    """Meshes under a light, prepared for ray casting."""
 
     def __init__(self, meshes: Sequence[trimesh.Trimesh], light: Light) -> None:
         """Prepare the meshes.
 
         Args:
-            meshes: Textured, all in the frame of the world, in metres.
-            light: What shines on them.
+            meshes: Textured meshes in the world frame, in meters.
+            light: The light.
         """
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         self.light = light
@@ -65,7 +65,7 @@ class Scene:
         self.intersector = RayMeshIntersector(solid)
 
     def forms(self, cam_from_world: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 3 faces"]:
-        """Of each face the linear forms of u, v, lit and one over a common factor."""
+        """Per face, the linear forms of u, v, brightness and 1, up to a common factor."""
         a, b, c = np.moveaxis((cam_from_world * self.vertices)[self.faces], 1, 0)
         weights = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
         return np.ascontiguousarray(np.einsum("fka,kfd->adf", self.attributes, weights))
@@ -80,12 +80,12 @@ def _visual(mesh: trimesh.Trimesh) -> TextureVisuals:
 def _picture(mesh: trimesh.Trimesh) -> Picture:
     image = _visual(mesh).material.image
     if image is None:
-        raise ValueError("meshes must have a texture, got one without a picture")
+        raise ValueError("meshes must have a texture image, got None")
     return np.asarray(image.convert("RGB"))
 
 
 class _Pyramids:
-    """Textures at half-octave steps of size, in one list of texels: one look-up serves every pixel."""
+    """Textures at half-octave steps of size, in one list of texels: one lookup serves every pixel."""
 
     def __init__(self, images: Sequence[Picture]) -> None:
         levels = [_shrunk(image, 2 ** (k / 2)) for image in images for k in range(_LEVELS)]
@@ -96,7 +96,7 @@ class _Pyramids:
     def look_up(
         self, images: Ids, uv: Float64[np.ndarray, "2 n"], spread: Float64[np.ndarray, " n"]
     ) -> Float32[np.ndarray, "n 3"]:
-        """Bilinear values at (u, v), where texels are about as wide as `spread` of the first level's."""
+        """Bilinear values at (u, v), in the level with texels about `spread` times as wide."""
         steps = np.rint(2 * np.log2(np.maximum(spread, 1))).astype(np.int64)
         level = images * _LEVELS + np.minimum(steps, _LEVELS - 1)
         sizes = self.sizes[:, level]
@@ -121,15 +121,15 @@ def _shrunk(image: Picture, factor: float) -> Picture:
 
 
 def render(scene: Scene, camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Image:
-    """See a scene through a camera.
+    """Render a scene.
 
-    One ray through the centre of each pixel, textures blurred to the pixel's footprint; pixels at the rim
-    of a surface are the mean of four rays.
+    Casts one ray through the center of each pixel, with textures blurred to the footprint of the pixel.
+    Pixels at the rim of a surface are the mean of four rays.
 
     Args:
-        scene: In the frame of the world.
-        camera: Any model of COLMAP; the image has its width and height.
-        cam_from_world: Where the camera stands.
+        scene: The scene, in the world frame.
+        camera: A camera of any COLMAP model; the image has its width and height.
+        cam_from_world: Pose of the camera.
     """
     pixels, forms = pixel_centers(camera), scene.forms(cam_from_world)
     directions = _directions(camera, pixels)
@@ -147,13 +147,13 @@ def render(scene: Scene, camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid
 def visible_meshes(
     scene: Scene, camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d
 ) -> Int64[np.ndarray, "height width"]:
-    """Which mesh the centre of each pixel sees: its place in the scene's list, or -1."""
+    """Index of the mesh that the center of each pixel sees, or -1."""
     faces = _seen(scene, cam_from_world, _directions(camera, pixel_centers(camera)))
     return np.where(faces < 0, -1, scene.mesh_of_face[faces]).reshape(camera.height, camera.width)
 
 
 def pixel_centers(camera: pycolmap.Camera) -> Points2D:
-    """Centres of all pixels, row after row; the first is (0.5, 0.5)."""
+    """Centers of all pixels, row by row; the first is (0.5, 0.5)."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
@@ -204,7 +204,7 @@ def _colors(
 
 
 def _spread(change: Float64[np.ndarray, "2 2 n"]) -> Float64[np.ndarray, " n"]:
-    """Width in texels of a pixel's footprint: its mean, but at least half its length where it is slanted."""
+    """Width of a pixel's footprint in texels: the mean, but at least half the length if it is slanted."""
     (u_x, u_y), (v_x, v_y) = change
     length = np.sqrt(u_x * u_x + u_y * u_y + v_x * v_x + v_y * v_y)
     return np.maximum(np.sqrt(np.abs(u_x * v_y - u_y * v_x)), 0.5 * length)

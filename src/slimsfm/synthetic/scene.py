@@ -1,4 +1,4 @@
-"""Two takes of an object: the tidy one that maps it, and the one that asks where the camera is."""
+"""Two takes of an object: a tidy one for mapping, and one with clutter for queries."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ EVENING = Light(
     ambient=(0.44, 0.46, 0.50),
     backdrop=(52.0, 60.0, 74.0),
 )
-"""Lower, warmer and from the other side than what shines while an object is mapped."""
+"""Lower, warmer and from another side than the light of mapping takes."""
 
 NOISE_SIGMA = 1.5
-"""Standard deviation of the sensor's noise, in grey levels of 0 to 255."""
+"""Standard deviation of the sensor noise, in gray levels from 0 to 255."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Take:
-    """A scene and the path of a camera through it. The object is the scene's first mesh."""
+    """A scene and a camera path through it. The object is the first mesh of the scene."""
 
     scene: Scene
     camera: pycolmap.Camera
@@ -35,71 +35,71 @@ class Take:
     seed: tuple[int, ...]
 
     def frame(self, index: int) -> Image:
-        """Render one frame, with the noise of the sensor; equal calls give equal images."""
+        """Render one frame with sensor noise; equal calls give equal images."""
         return with_noise(render(self.scene, self.camera, self.cam_from_object[index]), (*self.seed, index))
 
 
 def with_noise(image: Image, seed: tuple[int, ...]) -> Image:
-    """Add the noise of the sensor."""
+    """Add sensor noise."""
     noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
     return np.clip(np.rint(image + NOISE_SIGMA * noise), 0, 255).astype(np.uint8)
 
 
 def object_box(mesh: trimesh.Trimesh) -> Box:
-    """The axis-aligned box of a mesh."""
+    """Axis-aligned box of a mesh."""
     low, high = np.asarray(mesh.bounds, dtype=np.float64)
     return Box((low + high) / 2, np.diag((high - low) / 2))
 
 
 def mapping_take(name: str, frames: int, width: int, height: int, seed: int) -> Take:
-    """An object alone on a pale table, filmed all around.
+    """An object alone on a pale table, filmed from all sides.
 
     Args:
         name: A key of `OBJECTS`.
-        frames: Frames of the video.
-        width: Of an image, in pixels; the angle of view stays.
-        height: Of an image.
-        seed: Chooses the prints and the noise.
+        frames: Number of frames.
+        width: Image width in pixels; the field of view stays the same.
+        height: Image height in pixels.
+        seed: Seed of the prints and the noise.
 
     Raises:
-        ValueError: There is no object of that name.
+        ValueError: `name` is not in `OBJECTS`.
     """
     mesh, key = textured_object(name, seed), (seed, sorted(OBJECTS).index(name), 0)
     rng = np.random.default_rng(key)
     wood = texture.tinted_noise(rng, 512, 512, (186, 178, 168), 0.16)
     scene = Scene([mesh, shapes.ground(2.4, wood, shapes.lowest(mesh))], Light())
     path = trajectory.mapping_path(frames, viewing_distance(mesh))
-    return Take(scene=scene, camera=pinhole(width, height, 0.0), cam_from_object=tuple(path), seed=key)
+    return Take(scene=scene, camera=phone_camera(width, height, 0.0), cam_from_object=tuple(path), seed=key)
 
 
 def query_take(name: str, frames: int, width: int, height: int, seed: int) -> Take:
-    """The same object elsewhere: other light, a patterned table, things around it and posts in front of it.
+    """The same object elsewhere: other light, a patterned table, clutter around it and posts in front of it.
 
     Args:
         name: A key of `OBJECTS`.
-        frames: Frames of the video.
-        width: Of an image, in pixels; the angle of view stays.
-        height: Of an image.
-        seed: Chooses the prints, the things around and the noise.
+        frames: Number of frames.
+        width: Image width in pixels; the field of view stays the same.
+        height: Image height in pixels.
+        seed: Seed of the prints, the clutter and the noise.
 
     Raises:
-        ValueError: There is no object of that name.
+        ValueError: `name` is not in `OBJECTS`.
     """
     mesh, key = textured_object(name, seed), (seed, sorted(OBJECTS).index(name), 1)
     rng = np.random.default_rng(key)
     scene = elsewhere(rng, mesh)
     path = trajectory.query_path(rng, frames, 1.3 * viewing_distance(mesh))
-    return Take(scene=scene, camera=pinhole(width, height, 0.02), cam_from_object=tuple(path), seed=key)
+    return Take(scene=scene, camera=phone_camera(width, height, 0.02), cam_from_object=tuple(path), seed=key)
 
 
 TAKES: dict[str, Callable[[str, int, int, int, int], Take]] = {"mapping": mapping_take, "query": query_take}
 
 
 def textured_object(name: str, seed: int) -> trimesh.Trimesh:
-    """The object of a name.
+    """The mesh of an object.
 
     Raises:
-        ValueError: There is no object of that name.
+        ValueError: `name` is not in `OBJECTS`.
     """
     if name not in OBJECTS:
         raise ValueError(f"name must be one of {', '.join(OBJECTS)}, got {name!r}")
@@ -107,26 +107,29 @@ def textured_object(name: str, seed: int) -> trimesh.Trimesh:
 
 
 def elsewhere(rng: np.random.Generator, mesh: trimesh.Trimesh) -> Scene:
-    """An object in evening light on a patterned table, with things around it and posts in front of it."""
+    """An object in evening light on a patterned table, with clutter around it and posts in front of it."""
     cloth = texture.page(rng, 2000, 2000, cell=150) // 4 + 110
     table = shapes.ground(2.4, cloth, shapes.lowest(mesh))
     return Scene([mesh, table, *posts(rng, mesh), *things(rng, mesh)], EVENING)
 
 
 def viewing_distance(mesh: trimesh.Trimesh) -> float:
-    """From where a mesh fills a good part of the image."""
+    """Distance at which a mesh fills a good part of the image."""
     return 1.5 * object_box(mesh).diagonal
 
 
-def pinhole(width: int, height: int, change: float) -> pycolmap.Camera:
-    """A camera that sees 56 degrees from left to right, its centre slightly off; `change` tells two apart."""
+def phone_camera(width: int, height: int, change: float) -> pycolmap.Camera:
+    """A camera with a horizontal field of view of 56 degrees and an off-center principal point.
+
+    `change` varies focal length and principal point, so that two cameras differ.
+    """
     focal = 600 / 640 * width * (1 + change)
     center = (width * (0.5 + 0.006 - change), height * (0.5 - 0.008 + change))
     return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[focal, focal, *center])
 
 
 def posts(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Three thin posts around an object: each hides a part of it where the camera passes low behind it."""
+    """Three thin posts around an object: each hides a part of it when the camera passes low behind it."""
     x, y, z = mesh.extents
     around, height = 0.5 * float(np.hypot(x, y)) + 0.04, 1.2 * z
     made = []

@@ -1,4 +1,4 @@
-"""Meshes with texture coordinates, made of patches: grids of points, each with a picture of its own."""
+"""Textured meshes made of patches: grids of points, each with its own image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from slimsfm.synthetic.texture import Picture
 Grid = Float64[np.ndarray, "rows columns 3"]
 
 _GUTTER = 8
-"""Texels that repeat a picture's rim around it, so that blurred look-ups do not see its neighbour."""
+"""Texels around each image that repeat its rim, so that blurred lookups do not see its neighbor."""
 
 _SIDES = (
     ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -25,27 +25,27 @@ _SIDES = (
     ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
 )
-"""Of each side of a cube, as seen from outside: where it faces, its right, its up."""
+"""Normal, right and up direction of each side of a cube, seen from outside."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Patch:
-    """A bent sheet with a picture on it."""
+    """A curved sheet with an image."""
 
     points: Grid
-    """Rows run down and columns run right as seen from outside, in metres."""
+    """In meters; rows run down and columns run right, seen from outside."""
 
     image: Picture
 
     places: Float64[np.ndarray, "rows columns 2"] | None = None
-    """Where in the picture each point lies, from (0, 0) top left to (1, 1); None spreads it evenly."""
+    """Position of each point in the image, from (0, 0) at the top left to (1, 1); None spaces them evenly."""
 
 
 def assemble(patches: Sequence[Patch]) -> trimesh.Trimesh:
-    """Join patches into one mesh whose texture holds their pictures one above the other.
+    """Join patches into one mesh whose texture stacks their images vertically.
 
     Returns:
-        A mesh with the centre of its axis-aligned box at the origin.
+        A mesh with the center of its axis-aligned box at the origin.
     """
     padded = [np.pad(p.image, ((_GUTTER, _GUTTER), (_GUTTER, _GUTTER), (0, 0)), mode="edge") for p in patches]
     width = max(image.shape[1] for image in padded)
@@ -64,7 +64,7 @@ def assemble(patches: Sequence[Patch]) -> trimesh.Trimesh:
 
 
 def box(size: Sequence[float], images: Sequence[Picture]) -> trimesh.Trimesh:
-    """A box with one picture a side: four around counterclockwise from -y, then top and bottom."""
+    """A box with one image per side: four around counterclockwise from -y, then top and bottom."""
     points = [_side(side, 2) * np.array(size) / 2 for side in range(6)]
     return assemble([Patch(points=p, image=image) for p, image in zip(points, images, strict=True)])
 
@@ -72,7 +72,7 @@ def box(size: Sequence[float], images: Sequence[Picture]) -> trimesh.Trimesh:
 def lathe(
     radii: Sequence[float], heights: Sequence[float], image: Picture, lids: Sequence[Picture]
 ) -> trimesh.Trimesh:
-    """A body of revolution about z: its outline from top to bottom, the print around it, and its two lids."""
+    """A body of revolution about z: its outline from top to bottom, the print around it, and two lids."""
     turns = np.linspace(0, 2 * np.pi, 97)
     ring = np.stack([np.cos(turns), np.sin(turns), np.zeros_like(turns)], axis=1)
     outline = np.array([radii, heights]).T
@@ -89,9 +89,9 @@ def lathe(
 
 
 def sphere_sides(count: int) -> list[Grid]:
-    """Points of a unit sphere as the six sides of a swollen cube, `count` x `count` each.
+    """Points of a unit sphere as the six sides of an inflated cube, `count` x `count` each.
 
-    Six sides give texels of nearly one size everywhere; one picture wrapped around two poles would not.
+    Six sides give texels of nearly equal size; one image wrapped around two poles does not.
     """
     return [
         side / np.linalg.norm(side, axis=2, keepdims=True)
@@ -100,7 +100,7 @@ def sphere_sides(count: int) -> list[Grid]:
 
 
 def ground(size: float, image: Picture, z: float) -> trimesh.Trimesh:
-    """A level square about the z axis."""
+    """A horizontal square, centered on the z axis."""
     mesh = assemble([Patch(points=_side(4, 9) * (size / 2, size / 2, 0), image=image)])
     return mesh.apply_translation((0, 0, z))
 
@@ -128,6 +128,6 @@ def _triangles(patch: Patch) -> np.ndarray:
 
 
 def lowest(mesh: trimesh.Trimesh) -> float:
-    """The z on which a mesh stands."""
+    """Smallest z of a mesh."""
     vertices: Points3D = np.asarray(mesh.vertices)
     return float(vertices[:, 2].min())

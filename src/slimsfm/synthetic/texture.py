@@ -1,4 +1,4 @@
-"""Prints made by numbers: noise, and pages of text, pictures, shapes and bar codes."""
+"""Procedural prints: noise, and pages of text, pictures, shapes and bar codes."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from PIL import Image as PilImage
 from PIL import ImageDraw, ImageFont
 
 Picture = UInt8[np.ndarray, "_ _ 3"]
-"""RGB, of any size: pictures in one signature need not be equally large."""
+"""RGB image; pictures in one signature may differ in size."""
 
 _SYLLABLES = (
     "ka",
@@ -33,14 +33,14 @@ _SYLLABLES = (
 def fractal_noise(
     rng: np.random.Generator, height: int, width: int, cells: int = 4, octaves: int = 6
 ) -> Float32[np.ndarray, "_ _"]:
-    """Sum octaves of smoothly interpolated random grids into one picture with values in [0, 1].
+    """Sum octaves of smoothly interpolated random grids; the result has values in [0, 1].
 
     Args:
-        rng: Where the values come from.
-        height: Rows of the picture.
-        width: Columns of the picture.
+        rng: Random number generator.
+        height: Number of rows.
+        width: Number of columns.
         cells: Grid cells of the coarsest octave, in both directions.
-        octaves: Each has twice the cells and 0.6 times the weight of the one before.
+        octaves: Number of octaves; each has twice the cells and 0.6 times the weight of the previous one.
     """
     total = np.zeros((height, width), np.float32)
     for octave in range(octaves):
@@ -59,13 +59,13 @@ def tinted_noise(
     contrast: float,
     cells: int = 3,
 ) -> Picture:
-    """One colour whose brightness varies by noise; `contrast` 0 gives the plain colour."""
+    """One color whose brightness varies with noise; `contrast` 0 gives the plain color."""
     brightness = 1 + contrast * (fractal_noise(rng, height, width, cells, octaves=4) - 0.5)
     return np.clip(brightness[..., None] * np.array(color), 0, 255).astype(np.uint8)
 
 
 def picture(rng: np.random.Generator, height: int, width: int) -> Picture:
-    """An abstract photo: noise of many octaves, in colours along a random palette."""
+    """An abstract photo: noise of many octaves, in colors of a random palette."""
     palette = rng.uniform(0, 255, (6, 1)) + rng.uniform(-70, 70, (6, 3))
     position = fractal_noise(rng, height, width) * (len(palette) - 1)
     channels = [np.interp(position, np.arange(len(palette)), palette[:, k]) for k in range(3)]
@@ -73,7 +73,7 @@ def picture(rng: np.random.Generator, height: int, width: int) -> Picture:
 
 
 def page(rng: np.random.Generator, height: int, width: int, *, cell: int = 160) -> Picture:
-    """A printed page: cut into cells of about `cell` pixels, each filled with one kind of print."""
+    """A printed page of cells of about `cell` pixels, each with one kind of print."""
     sheet = PilImage.new("RGB", (width, height), _color(rng, 190, 256))
     for left, top, right, bottom in _cells(rng, (0, 0, width, height), cell):
         fill = _FILLS[rng.integers(len(_FILLS))]
@@ -82,14 +82,14 @@ def page(rng: np.random.Generator, height: int, width: int, *, cell: int = 160) 
 
 
 def stamp(image: Picture, print_: Picture, left: int, top: int) -> Picture:
-    """Copy `image` with `print_` pasted at a place."""
+    """Copy `image` and paste `print_` at a position."""
     result = image.copy()
     result[top : top + print_.shape[0], left : left + print_.shape[1]] = print_
     return result
 
 
 def label(rng: np.random.Generator, height: int, width: int) -> Picture:
-    """A word in large letters on a dark ground."""
+    """A word in large letters on a dark background."""
     return np.asarray(_headline(rng, height, width))
 
 

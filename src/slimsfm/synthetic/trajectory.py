@@ -1,4 +1,4 @@
-"""Camera paths around an object whose centre is the origin, z up."""
+"""Camera paths around an object with its center at the origin, z up."""
 
 import numpy as np
 import pycolmap
@@ -8,15 +8,15 @@ Vector = Float64[np.ndarray, "3"]
 
 
 def look_at(eye: Vector, target: Vector, roll_deg: float = 0.0) -> pycolmap.Rigid3d:
-    """The pose of a camera at `eye` that looks at `target`, upright but for the roll about its axis.
+    """Pose of a camera at `eye` that looks at `target`, upright except for a roll about its axis.
 
     Args:
-        eye: Where the camera is, in the world.
-        target: What it looks at; not straight above or below it.
-        roll_deg: Positive turns the picture counterclockwise.
+        eye: Position of the camera in the world.
+        target: Point to look at; not straight above or below the camera.
+        roll_deg: Positive values turn the image counterclockwise.
 
     Raises:
-        ValueError: The view is vertical, so that upright means nothing.
+        ValueError: The view is vertical, so upright is not defined.
     """
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -30,11 +30,11 @@ def look_at(eye: Vector, target: Vector, roll_deg: float = 0.0) -> pycolmap.Rigi
 
 
 def mapping_path(frames: int, radius: float) -> list[pycolmap.Rigid3d]:
-    """A spiral from 10 to 70 degrees above the horizon, with as many turns as keep neighbours evenly near.
+    """A spiral from 10 to 70 degrees above the horizon, with evenly spaced neighbors.
 
     Args:
-        frames: Poses along the path.
-        radius: Distance to the object's centre, in metres; it breathes by 8 %.
+        frames: Number of poses.
+        radius: Distance to the center of the object, in meters; it varies by 8 %.
     """
     share = (np.arange(frames) + 0.5) / frames
     azimuths = 2 * np.pi * share * np.sqrt(frames / 8)
@@ -43,14 +43,14 @@ def mapping_path(frames: int, radius: float) -> list[pycolmap.Rigid3d]:
 
 
 def query_path(rng: np.random.Generator, frames: int, radius: float) -> list[pycolmap.Rigid3d]:
-    """Another walk: once around the other way, up and down between 18 and 58 degrees, nearer and farther.
+    """A different path: once around in the other direction, between 18 and 58 degrees above the horizon.
 
-    The camera looks beside the centre by up to 8 % of the radius, and rolls by up to 15 degrees.
+    The camera misses the center by up to 8 % of the radius, and rolls by up to 15 degrees.
 
     Args:
-        rng: Where the unsteadiness of the hand comes from.
-        frames: Poses along the path.
-        radius: Mean distance to the object's centre, in metres; it varies by 22 %.
+        rng: Random number generator for the camera shake.
+        frames: Number of poses.
+        radius: Mean distance to the center of the object, in meters; it varies by 22 %.
     """
     share = (np.arange(frames) + 0.5) / frames
     elevations = np.radians(38 + 20 * np.sin(2 * np.pi * (2.3 * share + 0.15)))
@@ -68,7 +68,7 @@ def eyes(
     elevations: Float64[np.ndarray, " n"],
     radii: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Where cameras are that see the origin from these directions, in radians, and distances."""
+    """Positions at these azimuths and elevations, in radians, and distances from the origin."""
     level = np.cos(elevations)
     unit = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), np.sin(elevations)], axis=1)
     return radii[:, None] * unit

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from slimsfm.evaluation.outcomes import Outcomes
+from slimsfm.evaluation.results import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS
 
 BINS = 10

@@ -9,8 +9,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.arrays import Points2D, Points3D
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.protocol import Query
+from slimsfm.evaluation.protocol import PosedQuery
+from slimsfm.evaluation.results import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS, Box
 from slimsfm.mapping.map import Map
 from slimsfm.report.scene3d import view_frame
@@ -57,7 +57,7 @@ def reference_places(full: Map, reduced: Map) -> list[ReferencePlace]:
     ]
 
 
-def query_places(queries: Sequence[Query], before: Outcomes, after: Outcomes) -> list[QueryPlace]:
+def query_places(queries: Sequence[PosedQuery], before: Outcomes, after: Outcomes) -> list[QueryPlace]:
     """Queries and what became of them against the full and the reduced map.
 
     Raises:

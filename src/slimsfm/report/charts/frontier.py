@@ -7,8 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from slimsfm.evaluation.columns import size
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.table import Row, format_bytes
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.report.charts.labels import Label, place_labels
 from slimsfm.report.figures import COLORS, INK, PAPER, mark_logarithmic, new_figure, styled
@@ -54,7 +53,7 @@ def frontier_chart(rows: Sequence[Row]) -> Figure:
         by_size.set_ylabel(f"ADD-{ADD_FRACTIONS[0]}d: queries localized (%)")
         by_size.set_yticks([tick for tick in by_size.get_yticks() if 0 <= tick <= 100])
         by_size.set_ylim(*_limits(rows))
-        mark_logarithmic(by_size.xaxis, size)
+        mark_logarithmic(by_size.xaxis, format_bytes)
         mark_logarithmic(by_time.xaxis, lambda value: f"{value:g}")
         _draw_legend(figure, looks)
         figure.draw_without_rendering()

@@ -1,7 +1,7 @@
-"""A walk through a city as a map, made without an image: covisibility like a real one's, of any size.
+"""A walk through a city as a map, made without images: realistic covisibility at any size.
 
-The camera walks along facades around a block, some laps long, and looks at them sideways. An image sees what
-stands within a few steps; a later lap sees the same places again.
+The camera walks along the facades of a block, for several laps, and looks at them sideways. An image sees
+what is within a few steps; a later lap sees the same places again.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,34 +16,34 @@ from slimsfm.features import Features
 from slimsfm.geometry import Box
 from slimsfm.mapping.map import Map, MapInfo
 
-_REACH = 4.0  # metres of facade that an image sees to either side
-_DEPTH = 4.0  # metres from the camera to the facades, which vary by one
+_REACH = 4.0  # meters of facade that an image sees to either side
+_DEPTH = 4.0  # meters from the camera to the facades, which vary by one meter
 _SIZE = (640, 480)
 _FOCAL = 300.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class CityOptions:
-    """How large the city is."""
+    """Size of the city."""
 
     images: int = 1000
-    """Length of the walk; one image a metre."""
+    """Length of the walk; one image per meter."""
 
     keypoints: int = 2000
-    """Keypoints of an image; about half of them see a point."""
+    """Keypoints per image; about half of them see a point."""
 
     laps: int = 2
-    """How often each place is passed."""
+    """Number of times that the walk passes each place."""
 
     noise_px: float = 0.5
-    """Standard deviation of a keypoint's place."""
+    """Standard deviation of the keypoint positions."""
 
     seed: int = 0
     """Seed of every random choice."""
 
     def __post_init__(self) -> None:
         if self.laps < 1 or self.images < 20 * self.laps:
-            raise ValueError(f"images must be at least 20 a lap, got {self.images} in {self.laps} laps")
+            raise ValueError(f"images must be at least 20 per lap, got {self.images} in {self.laps} laps")
 
 
 def city_map(options: CityOptions = CityOptions()) -> Map:
@@ -84,9 +84,9 @@ class _Walk:
     def __init__(self, options: CityOptions) -> None:
         self.options = options
         rng = np.random.default_rng([options.seed, 0])
-        self.length = options.images / options.laps  # of a lap, in metres
+        self.length = options.images / options.laps  # of a lap, in meters
         self._radius = self.length / (2 * np.pi)
-        self._share = options.keypoints / 4 / _REACH  # points a metre: half the keypoints see one
+        self._share = options.keypoints / 4 / _REACH  # points per meter: half of the keypoints see one
         count = int(self.length * self._share)
         self.arcs = np.sort(rng.uniform(0, self.length, count))
         depth = self._radius + _DEPTH + rng.uniform(-1, 1, count)
@@ -103,7 +103,7 @@ class _Walk:
         return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ (self._radius * outward))
 
     def seen(self, number: int) -> Int64[np.ndarray, " n"]:
-        """The points an image sees, ascending."""
+        """Indices of the points that an image sees, ascending."""
         arc = number % self.length
         bounds = np.array([arc - _REACH, arc + _REACH])
         parts = [np.searchsorted(self.arcs, bounds + shift) for shift in (-self.length, 0.0, self.length)]
@@ -112,7 +112,7 @@ class _Walk:
         return found[np.all((inside > 0) & (inside < _SIZE), axis=1)].astype(np.int64)
 
     def keypoints(self, number: int) -> tuple[Float64[np.ndarray, "k 2"], Int64[np.ndarray, " n"]]:
-        """All keypoints of an image, those that see a point first, and these points."""
+        """All keypoints of an image, those that see a point first, and the indices of these points."""
         rng, seen = np.random.default_rng([self.options.seed, 1, number]), self.seen(number)
         pixels = self._pixels(number, seen) + rng.normal(0, self.options.noise_px, (len(seen), 2))
         stray = rng.uniform(0, _SIZE, (max(self.options.keypoints - len(seen), 0), 2))
@@ -124,7 +124,7 @@ class _Walk:
 
 
 class _Features(Mapping[str, Features]):
-    """Features made when asked for: a point's descriptor is drawn from its own seed, with some noise."""
+    """Features computed on access: a point's descriptor comes from its own seed, plus noise."""
 
     def __init__(self, walk: _Walk) -> None:
         self._walk = walk
@@ -154,7 +154,7 @@ class _Features(Mapping[str, Features]):
 
 
 class _Matches(Mapping[tuple[str, str], IndexPairs]):
-    """Of images that stand at most half a reach apart, on any lap: the points that both see."""
+    """Matches of images at most half a reach apart, on any lap: the points that both see."""
 
     def __init__(self, walk: _Walk) -> None:
         self._walk = walk

@@ -1,9 +1,9 @@
-"""Scenes that deceive: what fills the picture, or the object itself, speaks for wrong poses too.
+"""Deceptive scenes, in which the background or the object itself supports wrong poses.
 
-In the room the floor and the walls repeat, so a camera shifted by a period sees the same. Beside a twin there
-is a second place from where the object looks right. A box whose sides repeat or mirror each other looks right
-from behind. Each scene has a take that maps the object and one that asks where the camera is, as the plain
-objects have; the true pose is that of the mapped object, which stands at the origin.
+In the room the floor and the walls repeat, so a camera shifted by a period sees the same. A twin of the
+object creates a second place from which the object looks right. A box with repeated or mirrored sides looks
+right from behind. Each scene has a mapping take and a query take, as the plain objects have. The true pose is
+that of the mapped object at the origin.
 """
 
 from collections.abc import Callable
@@ -17,41 +17,41 @@ from jaxtyping import Float64
 from slimsfm.synthetic import shapes, texture, trajectory
 from slimsfm.synthetic.objects import printed_box
 from slimsfm.synthetic.render import Light, Scene
-from slimsfm.synthetic.scene import EVENING, Take, elsewhere, pinhole, posts, things, viewing_distance
+from slimsfm.synthetic.scene import EVENING, Take, elsewhere, phone_camera, posts, things, viewing_distance
 from slimsfm.synthetic.texture import Picture
 
 FLOOR_PERIOD, WALL_PERIOD = 0.12, 0.10
-"""Edges of a tile of the floor and of the wallpaper, in metres."""
+"""Edge lengths of the tiles of the floor and the wallpaper, in meters."""
 
 TWIN_FROM_OBJECT = pycolmap.Rigid3d(
     pycolmap.Rotation3d(np.array([0.0, 0.0, np.radians(115.0)])), np.array([0.21, -0.09, 0.0])
 )
-"""Where the twin stands: what moves the object onto it."""
+"""Pose of the twin: the motion from the object to it."""
 
 _TEXELS_PER_METRE = 2500
-_WALLS = 0.8  # metres from the object to the walls
-_ROOM = (-115.0, 25.0)  # azimuths in degrees from where a camera looks at the object and a wall behind it
+_WALLS = 0.8  # meters from the object to the walls
+_ROOM = (-115.0, 25.0)  # azimuths in degrees from which a camera sees the object in front of a wall
 _MAPPING, _QUERY = 0, 1
 
-Maker = Callable[[int, int, int, int], Take]
+TakeFunction = Callable[[int, int, int, int], Take]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Deception:
-    """An object and the two takes of it."""
+    """An object and its two takes."""
 
     object: Callable[[int], trimesh.Trimesh]
-    """Takes a seed and gives the mesh, the centre of its box at the origin."""
+    """From a seed to the mesh, with the center of its box at the origin."""
 
-    mapping: Maker
-    """Takes the frames, the width and height of an image in pixels, and the seed."""
+    mapping: TakeFunction
+    """From the number of frames, the image width and height in pixels, and the seed to the take."""
 
-    query: Maker
-    """Takes the same."""
+    query: TakeFunction
+    """Same arguments as `mapping`."""
 
 
 def label_box(seed: int) -> trimesh.Trimesh:
-    """A carton with one print of its own on each side and margins without any."""
+    """A carton with a different print on each side and plain margins."""
     rng, size = _rng(seed, "patterned_room", 2), (0.16, 0.11, 0.20)
     images = []
     for height, width in _faces(size):
@@ -62,7 +62,7 @@ def label_box(seed: int) -> trimesh.Trimesh:
 
 
 def patterned_room(frames: int, width: int, height: int, seed: int) -> Take:
-    """The carton in the corner of a room whose floor and wallpaper repeat strictly, filmed from near."""
+    """The carton in the corner of a room with strictly periodic floor and wallpaper, filmed from nearby."""
     rng, mesh = _rng(seed, "patterned_room", _MAPPING), label_box(seed)
     scene = Scene([mesh, *room(mesh, seed)], Light())
     share = (np.arange(frames) + 0.5) / frames
@@ -70,11 +70,11 @@ def patterned_room(frames: int, width: int, height: int, seed: int) -> Take:
     views = _views(sweep, 15 + 40 * share, 0.62 + 0.1 * np.sin(17 * share))
     aims = rng.uniform(-0.1, 0.1, (frames, 2))
     poses = [_aim(eye, aim, 0.0) for eye, aim in zip(views, aims, strict=True)]
-    return _take(scene, pinhole(width, height, 0.0), poses, _key(seed, "patterned_room", _MAPPING))
+    return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "patterned_room", _MAPPING))
 
 
 def patterned_room_query(frames: int, width: int, height: int, seed: int) -> Take:
-    """The same room in other light, with things in it; the carton is at times small, hidden or at the rim."""
+    """The same room with other light and clutter; the carton is sometimes small, hidden or at the rim."""
     rng, mesh = _rng(seed, "patterned_room", _QUERY), label_box(seed)
     light = Light(towards=(0.7, -0.3, 0.5), lamp=(0.60, 0.55, 0.46), ambient=(0.42, 0.44, 0.48))
     meshes = [mesh, *room(mesh, seed), *posts(rng, mesh), *things(rng, mesh), *_boards(rng, mesh)]
@@ -86,12 +86,12 @@ def patterned_room_query(frames: int, width: int, height: int, seed: int) -> Tak
     rolls = rng.uniform(-12, 12, frames).tolist()
     poses = [_aim(*view) for view in zip(views, aims, rolls, strict=True)]
     return _take(
-        Scene(meshes, light), pinhole(width, height, 0.02), poses, _key(seed, "patterned_room", _QUERY)
+        Scene(meshes, light), phone_camera(width, height, 0.02), poses, _key(seed, "patterned_room", _QUERY)
     )
 
 
 def room(mesh: trimesh.Trimesh, seed: int) -> list[trimesh.Trimesh]:
-    """A floor below a mesh and two walls behind it, each one tile over and over; the seed draws the tiles."""
+    """A floor below a mesh and two walls behind it, each with one repeated tile drawn from the seed."""
     rng, floor = _rng(seed, "patterned_room", 3), shapes.lowest(mesh)
     tiles = [_tile(rng, period) for period in (FLOOR_PERIOD, WALL_PERIOD)]
     ground = tiling(tiles[0], FLOOR_PERIOD, 30, 30).apply_translation((0.0, 0.0, floor))
@@ -106,9 +106,11 @@ def room(mesh: trimesh.Trimesh, seed: int) -> list[trimesh.Trimesh]:
 
 
 def tiling(tile: Picture, period: float, columns: int, rows: int) -> trimesh.Trimesh:
-    """A level sheet about the z axis, seen from above, of equal square tiles with edges of `period` metres.
+    """A horizontal sheet of equal square tiles around the z axis, seen from above.
 
-    Every tile has the same texture coordinates, so the pattern repeats exactly at every distance.
+    `period` is the edge length of a tile, in meters.
+
+    All tiles have the same texture coordinates, so the pattern repeats exactly at every distance.
     """
     height, width = tile.shape[:2]
     rim = min(height, width) // 4
@@ -130,11 +132,11 @@ def twins(frames: int, width: int, height: int, seed: int) -> Take:
     mesh = printed_box(seed)
     scene = Scene([mesh, _marble(mesh, seed)], Light())
     poses = trajectory.mapping_path(frames, 1.1 * viewing_distance(mesh))
-    return _take(scene, pinhole(width, height, 0.0), poses, _key(seed, "twins", _MAPPING))
+    return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "twins", _MAPPING))
 
 
 def twins_query(frames: int, width: int, height: int, seed: int) -> Take:
-    """The same box on the same table, and its twin, turned, beside it; the camera turns to both in turn."""
+    """The same box on the same table next to its rotated twin; the camera turns to both in turn."""
     rng, mesh = _rng(seed, "twins", _QUERY), printed_box(seed)
     twin = mesh.copy().apply_transform(np.vstack([TWIN_FROM_OBJECT.matrix(), (0, 0, 0, 1)]))
     scene = Scene([mesh, _marble(mesh, seed), twin, *things(rng, mesh)], EVENING)
@@ -142,14 +144,14 @@ def twins_query(frames: int, width: int, height: int, seed: int) -> Take:
     share = 0.5 + 0.5 * np.sin(2 * np.pi * 3.1 * (np.arange(frames) + 0.5) / frames)
     shifts = [pycolmap.Rigid3d(pycolmap.Rotation3d(), -s * TWIN_FROM_OBJECT.translation) for s in share]
     poses = [pose * shift for pose, shift in zip(around, shifts, strict=True)]
-    return _take(scene, pinhole(width, height, 0.02), poses, _key(seed, "twins", _QUERY))
+    return _take(scene, phone_camera(width, height, 0.02), poses, _key(seed, "twins", _QUERY))
 
 
 def ambiguous_box(seed: int) -> trimesh.Trimesh:
-    """A box that looks nearly the same from behind.
+    """A box that looks almost the same from behind.
 
-    Front and back have one print, but for a small label on the front. Right is the mirror image of left. Top
-    and bottom are the same after half a turn.
+    Front and back have one print, except for a small label on the front. Right is the mirror image of left.
+    Top and bottom are equal after half a turn.
     """
     rng, size = _rng(seed, "mirrored_box", 2), (0.18, 0.12, 0.15)
     (front, side, _, _, top, _) = (texture.page(rng, *face, cell=150) for face in _faces(size))
@@ -161,20 +163,20 @@ def ambiguous_box(seed: int) -> trimesh.Trimesh:
 
 
 def mirrored_box(frames: int, width: int, height: int, seed: int) -> Take:
-    """The ambiguous box alone on a pale table, filmed all around."""
+    """The ambiguous box alone on a pale table, filmed from all sides."""
     rng, mesh = _rng(seed, "mirrored_box", _MAPPING), ambiguous_box(seed)
     wood = texture.tinted_noise(rng, 512, 512, (186, 178, 168), 0.16)
     scene = Scene([mesh, shapes.ground(2.4, wood, shapes.lowest(mesh))], Light())
     poses = trajectory.mapping_path(frames, viewing_distance(mesh))
-    return _take(scene, pinhole(width, height, 0.0), poses, _key(seed, "mirrored_box", _MAPPING))
+    return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "mirrored_box", _MAPPING))
 
 
 def mirrored_box_query(frames: int, width: int, height: int, seed: int) -> Take:
-    """The ambiguous box on another table, in other light, with things around it and posts in front of it."""
+    """The ambiguous box on another table, in other light, with clutter around it and posts in front of it."""
     rng, mesh = _rng(seed, "mirrored_box", _QUERY), ambiguous_box(seed)
     scene = elsewhere(rng, mesh)
     poses = trajectory.query_path(rng, frames, 1.4 * viewing_distance(mesh))
-    return _take(scene, pinhole(width, height, 0.02), poses, _key(seed, "mirrored_box", _QUERY))
+    return _take(scene, phone_camera(width, height, 0.02), poses, _key(seed, "mirrored_box", _QUERY))
 
 
 DECEPTIONS: dict[str, Deception] = {
@@ -212,7 +214,7 @@ def _marble(mesh: trimesh.Trimesh, seed: int) -> trimesh.Trimesh:
 
 
 def _boards(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Two boards before an object: from behind one of them only a part of the object is seen."""
+    """Two boards in front of an object: from behind a board only a part of the object is visible."""
     height, made = 0.95 * mesh.extents[2], []
     for azimuth in (-85.0, -20.0):
         images = [texture.page(rng, 300, 200, cell=90) for _ in range(6)]
@@ -238,13 +240,13 @@ def _views(
     elevations_deg: Float64[np.ndarray, " n"],
     radii: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Eyes around the origin; a sweep from 0 to 1 goes through all azimuths with a wall behind the object."""
+    """Eyes around the origin; a sweep from 0 to 1 covers all azimuths with a wall behind the object."""
     azimuths = _ROOM[0] + (_ROOM[1] - _ROOM[0]) * sweep
     return trajectory.eyes(np.radians(azimuths), np.radians(elevations_deg), radii)
 
 
 def _aim(eye: trajectory.Vector, aim: Float64[np.ndarray, "2"], roll_deg: float) -> pycolmap.Rigid3d:
-    """Look past the origin, which appears off the middle by `aim`, in focal lengths to the right and down."""
+    """Look past the origin, which appears off-center by `aim`, in focal lengths to the right and down."""
     towards = np.array([-aim[0], -aim[1], 1.0]) * np.linalg.norm(eye)
     target = trajectory.look_at(eye, np.zeros(3)).inverse() * towards
     return trajectory.look_at(eye, target, roll_deg)

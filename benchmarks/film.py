@@ -1,4 +1,4 @@
-"""A film of an object for those who track: a hand-held camera, turned fast, blocked once and cut once."""
+"""A film of an object for tracking: a hand-held camera with fast turns, one occlusion and one cut."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from slimsfm.synthetic.render import Light, Scene, render, visible_meshes
 from slimsfm.synthetic.scene import (
     elsewhere,
     object_box,
-    pinhole,
+    phone_camera,
     textured_object,
     viewing_distance,
     with_noise,
@@ -32,49 +32,49 @@ _PAN_HZ, _ROLL_HZ = 1.2, 1.1
 _PANS = ((0.10, 0.26), (0.60, 0.72), (0.90, 0.98))
 _ROLLS = ((0.30, 0.44), (0.64, 0.74))
 _CUT, _BLOCKED = 0.52, 0.78
-"""When these happen, as shares of the film."""
+"""Times of these events, as shares of the film."""
 
-_LENS = 0.02  # how the camera differs from the one that mapped
-_SLIDE = 12  # frames in which the plate comes or goes; the object is hidden in half of them
-_PLATE_DEPTH, _PLATE_AWAY = 0.10, 0.155  # metres before the camera; to its side when out of sight
-_BLUR_PX = 2.0  # of the plate in an image 640 pixels wide: it is too near to be in focus
-_COARSE = 120  # pixels from left to right of the image in which the visible share is counted
+_LENS = 0.02  # difference to the camera of the mapping take
+_SLIDE = 12  # frames in which the plate enters or leaves; it hides the object in half of them
+_PLATE_DEPTH, _PLATE_AWAY = 0.10, 0.155  # meters in front of the camera; to its side when out of sight
+_BLUR_PX = 2.0  # blur of the plate in an image 640 pixels wide, because it is out of focus
+_COARSE = 120  # width in pixels of the images that measure the visible share
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Film:
-    """A scene, a path of a camera through it, and a plate that is held before the camera for a while."""
+    """A scene, a camera path through it, and a plate that is held in front of the camera for a while."""
 
     scene: Scene
-    """In the frame of the object, which is its first mesh."""
+    """The scene in the frame of the object, which is its first mesh."""
 
     plate: Scene
-    """In the frame of the plate; nearer than all of the scene where it is seen."""
+    """The plate in its own frame; where visible, it is nearer than the scene."""
 
     camera: pycolmap.Camera
 
     cam_from_object: tuple[pycolmap.Rigid3d, ...]
-    """One a frame, `FRAMES_PER_SECOND`."""
+    """One pose per frame, at `FRAMES_PER_SECOND`."""
 
     cam_from_plate: Mapping[int, pycolmap.Rigid3d]
-    """By the index of those frames that may see the plate."""
+    """Poses by frame index, for frames that may see the plate."""
 
     visible: Series
-    """Of each frame the share of the object's pixels that nothing hides; all of them lie in the image."""
+    """Per frame, the share of unoccluded pixels of the object; all of them are inside the image."""
 
     cut: int
-    """The first frame after the cut: the camera jumps to it from the frame before."""
+    """The first frame after the cut, where the camera jumps."""
 
     occlusion: range
-    """The frames in which the plate hides the object wholly."""
+    """The frames in which the plate hides the object completely."""
 
     box: Box
-    """Of the object, in its frame."""
+    """Box of the object, in its frame."""
 
     seed: tuple[int, ...]
 
     def frame(self, index: int) -> Image:
-        """Render one frame, with the noise of the sensor; equal calls give equal images."""
+        """Render one frame with sensor noise; equal calls give equal images."""
         image = render(self.scene, self.camera, self.cam_from_object[index])
         if index in self.cam_from_plate:
             image = _blocked(image, self.plate, self.camera, self.cam_from_plate[index])
@@ -84,23 +84,23 @@ class Film:
 def film(
     name: str = "printed_box", frames: int = 600, width: int = 640, height: int = 480, seed: int = 0
 ) -> Film:
-    """Film an object among the things of its query take.
+    """Film an object among the clutter of its query take.
 
-    The camera walks around the object at 17 degrees a second. In some passages it pans by up to 68 or rolls
-    by up to 180 degrees a second, so that the object moves by about 4 % of the image's width from frame to
-    frame, and yet stays in the image. Speeds hardly depend on the length of the film; when things happen
-    does: the cut is near its middle, and a plate hides the object for a twentieth of it, or 13 frames if that
-    is more.
+    The camera walks around the object at 17 degrees per second. In some passages it pans by up to 68 or rolls
+    by up to 180 degrees per second, so that the object moves by about 4 % of the image width from frame to
+    frame, but stays in the image. Speeds hardly depend on the length of the film, but the times of events do:
+    the cut is near the middle, and a plate hides the object for a twentieth of the film, or for 13 frames if
+    that is more.
 
     Args:
         name: A key of `OBJECTS`.
-        frames: Frames of the film, at least 200.
-        width: Of an image, in pixels; the angle of view stays.
-        height: Of an image.
-        seed: Chooses the prints, the things around, the unsteadiness of the hand and the noise.
+        frames: Number of frames, at least 200.
+        width: Image width in pixels; the field of view stays the same.
+        height: Image height in pixels.
+        seed: Seed of the prints, the clutter, the camera shake and the noise.
 
     Raises:
-        ValueError: There is no object of that name, or the film is too short for all that happens in it.
+        ValueError: `name` is not in `OBJECTS`, or the film is too short for all its events.
     """
     if frames < 200:
         raise ValueError(f"frames must be at least 200, got {frames}")
@@ -116,7 +116,7 @@ def film(
     return Film(
         scene=scene,
         plate=plate,
-        camera=pinhole(width, height, _LENS),
+        camera=phone_camera(width, height, _LENS),
         cam_from_object=tuple(poses),
         cam_from_plate=plates,
         visible=visible,
@@ -150,7 +150,7 @@ def _turned(axis_angle: Float64[np.ndarray, "3"]) -> pycolmap.Rigid3d:
 
 
 def _pass(share: Series, passages: tuple[tuple[float, float], ...]) -> Series:
-    """1 in the passages, 0 elsewhere, and smooth between."""
+    """1 in the passages, 0 elsewhere, with smooth transitions."""
     total = np.zeros_like(share)
     for start, stop in passages:
         edge = 0.25 * (stop - start)
@@ -164,7 +164,7 @@ def _smooth(value: Series) -> Series:
 
 
 def _tremor(rng: np.random.Generator, time: Series, amplitude_deg: float) -> Series:
-    """The unsteadiness of a hand: three waves, the slower the larger."""
+    """Shake of a hand: three waves, slower ones with larger amplitudes."""
     waves = zip((0.4, 1.3, 3.7), (1.0, 0.3, 0.08), rng.uniform(0, 2 * np.pi, 3), strict=True)
     return sum(
         (amplitude_deg * size * np.sin(2 * np.pi * hz * time + phase) for hz, size, phase in waves),
@@ -193,7 +193,7 @@ def _plate_path(held: range) -> dict[int, pycolmap.Rigid3d]:
 
 
 def _blocked(image: Image, plate: Scene, camera: pycolmap.Camera, cam_from_plate: pycolmap.Rigid3d) -> Image:
-    """Lay the plate over an image, out of focus."""
+    """Draw the plate over an image, out of focus."""
     covered = (visible_meshes(plate, camera, cam_from_plate) >= 0).astype(np.float32)[..., None]
     sigma = _BLUR_PX * camera.width / 640
     layers = np.concatenate([render(plate, camera, cam_from_plate) * covered, covered], axis=2)
@@ -203,7 +203,7 @@ def _blocked(image: Image, plate: Scene, camera: pycolmap.Camera, cam_from_plate
 
 
 def _coarse(width: int, height: int) -> pycolmap.Camera:
-    return pinhole(_COARSE, round(_COARSE * height / width), _LENS)
+    return phone_camera(_COARSE, round(_COARSE * height / width), _LENS)
 
 
 def _visible(
@@ -213,11 +213,11 @@ def _visible(
     poses: list[pycolmap.Rigid3d],
     plates: Mapping[int, pycolmap.Rigid3d],
 ) -> Series:
-    """Count the object's pixels in the first scene, behind the plate, against those in the second."""
+    """Visible pixels of the object in the first scene, behind the plate, over those in the second."""
     shares = []
     for index, pose in enumerate(poses):
         seen, whole = (visible_meshes(scene, camera, pose) == 0 for scene in scenes)
-        seen &= whole  # at a rim they may differ by a pixel
+        seen &= whole  # they may differ by a pixel at a rim
         if index in plates:
             seen &= visible_meshes(plate, camera, plates[index]) < 0
         shares.append(seen.sum() / whole.sum())
