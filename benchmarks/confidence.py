@@ -25,7 +25,7 @@ from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.localization.verification import RIGHT
-from slimsfm.mapping.direct import direct_map
+from slimsfm.mapping.subset import direct_map
 from slimsfm.synthetic.objects import OBJECTS
 
 KEPT = (1.0, 0.25, 0.08)  # shares of a query's keypoints

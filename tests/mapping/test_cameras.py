@@ -3,7 +3,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.mapping.cameras import guess_cameras
+from slimsfm.mapping.extraction import guess_cameras
 
 
 @pytest.fixture

@@ -13,10 +13,9 @@ from slimsfm.geometry import corner_error
 from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import PointDescriptors, check_map
-from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.subset import direct_map, keep_images, with_points
 from slimsfm.reduction import FrontierOptions, frontier
 
 HALF_A_STEP = 0.5 / 15  # of the range between the smallest and the largest value

@@ -6,10 +6,9 @@ import pytest
 from scenes import exact_map
 from slimsfm.errors import MapError
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map
-from slimsfm.mapping.global_descriptors import describe_images, with_global_descriptors
+from slimsfm.mapping.descriptors import describe_images, with_global_descriptors
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
-from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.subset import direct_map, keep_images
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,10 @@ from slimsfm.errors import InputError, MapError, OutputError
 from slimsfm.features import unit_rows
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import corner_error
-from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.subset import Selection, keep_images
+from slimsfm.mapping.subset import Selection, direct_map, keep_images
 
 NAMES = ["cam 1/front view.png", "cam 1/side.png", "cam-2/a/1.png", "cam-2/a/2.png", "x y.png", "z.png"]
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from slimsfm.errors import InputError, MapError
 from slimsfm.features import unit_rows
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map
+from slimsfm.mapping.descriptors import quantize, read_point_descriptors, write_point_descriptors
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.point_file import quantize, read_point_descriptors, write_point_descriptors
+from slimsfm.mapping.subset import direct_map
 
 SHAPES = {"count": st.integers(1, 12), "dimensions": st.integers(1, 33), "seed": st.integers(0, 10**6)}
 

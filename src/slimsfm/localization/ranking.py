@@ -5,7 +5,7 @@ from jaxtyping import Float32
 
 from slimsfm.arrays import Descriptors
 from slimsfm.features.vlad import vlad
-from slimsfm.mapping.global_descriptors import describe_images
+from slimsfm.mapping.descriptors import describe_images
 from slimsfm.mapping.map import Map
 
 _STRONGEST = 2048  # keypoints that tell what a query looks like

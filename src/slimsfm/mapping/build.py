@@ -15,14 +15,12 @@ from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.build_keypoint_free import PhotoFolder, build_without_keypoints
-from slimsfm.mapping.cameras import CameraSharing, guess_cameras
 from slimsfm.mapping.cell_keypoints import Matches
-from slimsfm.mapping.extraction import color_points, extract_features
-from slimsfm.mapping.global_descriptors import with_global_descriptors
+from slimsfm.mapping.descriptors import with_global_descriptors
+from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.image_pairs import choose_image_pairs
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.pair_matching import match_pairs_with, verify_pairs
-from slimsfm.mapping.pairs import PairChoice, choose_pairs
+from slimsfm.mapping.pairs import PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.photo_file import shrink_photo
 from slimsfm.mapping.sfm import (
     match_pairs,

@@ -13,10 +13,10 @@ from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
 from slimsfm.mapping.box import estimate_box, read_box
-from slimsfm.mapping.global_descriptors import with_global_descriptors
+from slimsfm.mapping.descriptors import with_global_descriptors
+from slimsfm.mapping.extraction import redescribe
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, read_model
-from slimsfm.mapping.redescribe import redescribe
 from slimsfm.mapping.sfm import verified_matches
 from slimsfm.progress import ProgressBar, silent
 

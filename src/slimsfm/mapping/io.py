@@ -21,11 +21,15 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
-from slimsfm.mapping.global_descriptors import read_global_descriptors, write_global_descriptors
+from slimsfm.mapping.descriptors import (
+    read_global_descriptors,
+    read_point_descriptors,
+    write_global_descriptors,
+    write_point_descriptors,
+)
 from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
 from slimsfm.mapping.model import read_model
 from slimsfm.mapping.photo_file import PhotoFile, write_photos
-from slimsfm.mapping.point_file import read_point_descriptors, write_point_descriptors
 
 FORMAT_VERSION = 1
 """Version of the layout; a map of a later one is refused."""

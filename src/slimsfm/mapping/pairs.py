@@ -2,14 +2,19 @@
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from itertools import combinations
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float32
 
-from slimsfm.features import Features, unit_rows
+from slimsfm.arrays import IndexPairs
+from slimsfm.features import Features, Matcher, unit_rows
 from slimsfm.features.vlad import learn_words, vlad
+from slimsfm.progress import ProgressBar, silent
 
 Pairs = list[tuple[str, str]]
 """Pairs of image names, each in sorted order, without repetition, sorted."""
@@ -17,6 +22,7 @@ Pairs = list[tuple[str, str]]
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 
 _MOST_EXHAUSTIVE = 200  # images, up to which "auto" matches each with every other one
+_CACHED = 256  # images whose features are kept in memory
 _WORD_SAMPLES = 50_000  # descriptors that words are learned from
 
 
@@ -70,3 +76,30 @@ def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def match_pairs_with(
+    matcher: Matcher, features: Mapping[str, Features], pairs: Pairs, progress: ProgressBar = silent
+) -> dict[tuple[str, str], IndexPairs]:
+    """Match pairs of images by their features; pairs without a match are left out."""
+    read = lru_cache(_CACHED)(features.__getitem__)
+    found = {}
+    for a, b in progress(pairs, "match pairs"):
+        matches = matcher.match(read(a), read(b))
+        if len(matches):
+            found[a, b] = matches
+    return found
+
+
+def verify_pairs(
+    database: Path, names: list[str], matches: Mapping[tuple[str, str], IndexPairs], *, seed: int
+) -> None:
+    """Write matches into a database whose images are numbered from 1 in order of names, and verify them."""
+    ids = {name: image_id for image_id, name in enumerate(names, start=1)}
+    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+        for (a, b), pairs in sorted(matches.items()):
+            opened.write_matches(ids[a], ids[b], pairs.astype(np.uint32))
+    verifier, geometry = pycolmap.GeometricVerifierOptions(), pycolmap.TwoViewGeometryOptions()
+    verifier.num_threads = 1  # equal matches are to give equal inliers
+    geometry.ransac.random_seed = seed
+    pycolmap.geometric_verification(database, verifier, two_view_geometry_options=geometry)

@@ -8,7 +8,7 @@ saves.
 import lzma
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -19,9 +19,11 @@ from jaxtyping import Float32, UInt8
 from slimsfm.arrays import Descriptors, Mask
 from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
-from slimsfm.mapping.map import PointDescriptors
+from slimsfm.features.vlad import learn_words, vlad
+from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors
 
 _LEVELS = 15
+_SAMPLE = 500  # descriptors of one image that words are learned from
 _INT8_MAX = np.iinfo(np.int8).max
 UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError),
@@ -133,3 +135,49 @@ def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
     if len(packed) != (count + 7) // 8:
         raise ValueError(f"{len(packed)} bytes do not hold a bit of each of {count} points")
     return np.unpackbits(packed, count=count).astype(bool)
+
+
+def with_global_descriptors(map: Map) -> Map:
+    """The map with a global descriptor of each reference image."""
+    return replace(map, global_descriptors=describe_images(map))
+
+
+def describe_images(map: Map, seed: int = 0) -> GlobalDescriptors:
+    """A global descriptor of each reference image.
+
+    Words are learned from the map's own descriptors, and only keypoints that see a point of the map count:
+    what is not in the map must not make a query resemble it. O(observations).
+    """
+    words = learn_words(np.concatenate([_seen(map, name)[:_SAMPLE] for name in map.images]), seed)
+    rows = np.stack([vlad(_seen(map, name), words) for name in map.images])
+    return GlobalDescriptors(vocabulary=words, descriptors=rows)
+
+
+def _seen(map: Map, name: str) -> Descriptors:
+    return unit_rows(map.features[name].descriptors[map.observations[name].rows])
+
+
+def write_global_descriptors(path: Path, global_descriptors: GlobalDescriptors) -> None:
+    """Write global descriptors: half a byte a value, as descriptors of points are."""
+    with path.open("wb") as file:
+        arrays: dict[str, Any] = {
+            "words": global_descriptors.vocabulary,
+            **pack(global_descriptors.descriptors),
+        }
+        np.savez(file, **arrays)
+
+
+def read_global_descriptors(path: Path, num_images: int) -> GlobalDescriptors:
+    """Read global descriptors of so many images.
+
+    Raises:
+        InputError: The file is damaged, or of another map.
+    """
+    try:
+        with path.open("rb") as opened, np.load(opened) as file:
+            words, rows = file["words"].astype(np.float32), unpack(file, num_images)
+        if words.ndim != 2 or rows.shape[1] != words.size:
+            raise ValueError(f"rows of {rows.shape[1]} values do not fit words of shape {words.shape}")
+        return GlobalDescriptors(vocabulary=words, descriptors=rows)
+    except UNREADABLE as error:
+        raise InputError(f"{path}: damaged ({error}); build or import the map again") from error
