@@ -41,7 +41,7 @@ SKEWED = (BOX.corners * [[3.0]] + np.eye(8, 3)).tolist()
 )
 def test_json_that_holds_no_box_is_an_input_error(tmp_path, text):
     (tmp_path / "box.json").write_text(text)
-    with pytest.raises(InputError, match=r"box\.json: should hold the 8 corners"):
+    with pytest.raises(InputError, match=r"box\.json: must hold the 8 corners"):
         read_box(tmp_path / "box.json")
 
 
@@ -50,7 +50,7 @@ def test_json_that_holds_no_box_is_an_input_error(tmp_path, text):
 )
 def test_text_that_holds_no_box_is_an_input_error(tmp_path, text):
     (tmp_path / "box3d_corners.txt").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=r"box3d_corners\.txt: should hold the 8 corners"):
+    with pytest.raises(InputError, match=r"box3d_corners\.txt: must hold the 8 corners"):
         read_box(tmp_path / "box3d_corners.txt")
 
 

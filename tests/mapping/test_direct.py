@@ -177,7 +177,7 @@ def test_what_is_kept_of_a_map_for_both_is_for_images_again(partial):
     ids=["auto", *EDGE_SOURCES, "exhaustive", "keep_images", "frontier"],
 )
 def test_what_needs_features_says_which_map_has_them(direct, use):
-    with pytest.raises(MapError, match=r"direct matching alone.*use the map that it was made of"):
+    with pytest.raises(MapError, match=r"direct matching alone.*use the map that it was reduced from"):
         use(direct)
 
 

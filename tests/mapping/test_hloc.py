@@ -16,7 +16,7 @@ from slimsfm.geometry import corner_error
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.subset import Selection, direct_map, keep_images
+from slimsfm.mapping.subset import FilteredMapping, direct_map, keep_images
 
 NAMES = ["cam 1/front view.png", "cam 1/side.png", "cam-2/a/1.png", "cam-2/a/2.png", "x y.png", "z.png"]
 
@@ -236,17 +236,17 @@ def test_hlocs_localization_finds_the_true_poses(exact, tmp_path, stored):
 def test_a_map_for_direct_matching_is_refused(exact, tmp_path):
     rows = np.arange(5)
     points = PointDescriptors(points=rows, descriptors=np.eye(5, 32, dtype=np.float32))
-    with pytest.raises(MapError, match=r"direct matching alone.*slimsfm reduce MAP -o SMALL --for images"):
+    with pytest.raises(MapError, match=r"direct matching alone.*reduced for matching images"):
         write_hloc(direct_map(exact, points), tmp_path / "out")
     assert contents(tmp_path) == {}
 
 
 def test_pairs_that_hloc_would_misread_are_refused(exact, tmp_path):
-    with pytest.raises(InputError, match=r"'my query\.png': hloc reads no pair of a name with a space"):
+    with pytest.raises(InputError, match=r"'my query\.png': hloc cannot read pairs of names with spaces"):
         write_hloc(exact, tmp_path / "out", ["my query.png"])
-    with pytest.raises(InputError, match=r"'cam 1/front view\.png': hloc reads no pair"):
+    with pytest.raises(InputError, match=r"'cam 1/front view\.png': hloc cannot read pairs"):
         write_hloc(renamed(exact, NAMES), tmp_path / "out", ["query.png"])
-    with pytest.raises(InputError, match=r"query '003\.png' is called as an image of the map is"):
+    with pytest.raises(InputError, match=r"query '003\.png' has the name of an image of the map"):
         write_hloc(exact, tmp_path / "out", ["query.png", "003.png"])
     assert contents(tmp_path) == {}
 
@@ -262,7 +262,7 @@ def test_a_missing_part_leaves_nothing_behind(exact, tmp_path):
 
 
 def test_a_reduced_map_needs_no_features_of_dropped_images(exact, tmp_path):
-    kept = Selection(exact.features, {"002.png", "003.png"}.__contains__)
+    kept = FilteredMapping(exact.features, {"002.png", "003.png"}.__contains__)
     write_hloc(replace(keep_images(exact, list(kept)), features=kept), tmp_path / "out")
     with h5py.File(tmp_path / "out" / "features.h5", "r") as file:
         assert sorted(file) == ["002.png", "003.png"]

@@ -220,7 +220,7 @@ def test_a_track_without_an_observation_that_its_image_has_is_a_model_error(text
     row = first_record(lines)
     lines[row] = " ".join(lines[row].split(" ")[:-2])
     (text / "points3D.txt").write_text("\n".join(lines))
-    with pytest.raises(ModelError, match="refer to each other"):
+    with pytest.raises(ModelError, match="do not belong together"):
         read_model(text)
 
 

@@ -10,7 +10,7 @@ from scenes import exact_map, with_matches
 from slimsfm.errors import InputError
 from slimsfm.features import Features
 from slimsfm.mapping.io import read_map, write_map
-from slimsfm.mapping.subset import Selection, keep_images
+from slimsfm.mapping.subset import FilteredMapping, keep_images
 
 PARTIAL = with_matches(exact_map(8, 60, reach_deg=80))
 NAMES = list(PARTIAL.images)
@@ -135,7 +135,7 @@ def test_a_selection_reads_only_what_is_asked_for():
             return super().__getitem__(key)
 
     asked: list[str] = []
-    chosen = Selection(Source(a=1, b=2, c=3), {"a", "c"}.__contains__)
+    chosen = FilteredMapping(Source(a=1, b=2, c=3), {"a", "c"}.__contains__)
     assert list(chosen) == ["a", "c"]
     assert len(chosen) == 2
     assert "b" not in chosen

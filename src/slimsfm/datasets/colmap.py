@@ -62,7 +62,7 @@ class Colmap:
     def load(self, name: str, making: Making) -> ObjectSequences:
         """Import the model, and hold the queries out."""
         check_known(name, self.names(), self.path)
-        truth = import_colmap(self.path, self._import_options(), making.progress)
+        truth = import_colmap(self.path, options=self._import_options(), progress=making.progress)
         for one in truth.images:
             self._check_image(truth, one)
         listed = self.queries

@@ -6,7 +6,6 @@ remaining images observe. What is left is a map that knows nothing of them.
 """
 
 import logging
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,9 +117,7 @@ def _pseudo_ground_truth(folder: Path, making: Making) -> Map:
     """
     names, path = set(list_images(folder)), making.folder / "pseudo-ground-truth"
     if not path.exists():
-        with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
-            made = build_map(folder, Path(workspace), making.build, progress=making.progress)
-            write_map(made.map, path)
+        write_map(build_map(folder, making.build, progress=making.progress), path)
     truth = read_map(path)
     if strangers := truth.images.keys() - names:
         raise InputError(

@@ -1,8 +1,7 @@
-"""Descriptors of points on disk: four bits a dimension.
+"""Descriptors of points and of whole images, and their compact files: four bits per dimension.
 
-Half a byte loses nothing that could be measured on photographs, neither in poses nor in queries localized,
-and needs no table as product quantization does, which for some hundred points would be larger than what it
-saves.
+On photos, four bits per dimension lose neither accuracy nor localized queries. Product quantization needs a
+table, which is larger than the descriptors of a few hundred points.
 """
 
 import lzma
@@ -23,42 +22,42 @@ from slimsfm.features.vlad import learn_words, vlad
 from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors
 
 _LEVELS = 15
-_SAMPLE = 500  # descriptors of one image that words are learned from
+_SAMPLE = 500  # descriptors per image that the vocabulary is learned from
 _INT8_MAX = np.iinfo(np.int8).max
 UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError),
-    *(BadZipFile, RuntimeError, zlib.error, lzma.LZMAError),  # what zip and its parts raise
+    *(BadZipFile, RuntimeError, zlib.error, lzma.LZMAError),  # raised by zip files and their parts
 )
-"""What reading a damaged file of arrays may raise."""
+"""Exceptions that reading a damaged file of arrays may raise."""
 
-_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes have no context
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes lack context
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Quantized:
-    """Descriptors of which each value is one of 16 between the smallest and the largest of all."""
+    """Descriptors with values rounded to 16 equidistant levels."""
 
     codes: UInt8[np.ndarray, "n bytes"]
-    """Two values a byte, the first in the upper half; the last half byte may be padding."""
+    """Two values per byte, the first in the upper half; the last half byte may be padding."""
 
     dimensions: int
-    """Values a descriptor."""
+    """Number of values per descriptor."""
 
     low: float
-    """What code 0 stands for."""
+    """Value of code 0."""
 
     high: float
-    """What code 15 stands for."""
+    """Value of code 15."""
 
     def restore(self) -> Descriptors:
-        """The descriptors, of unit length again."""
+        """Restore the descriptors, rounded and of unit length."""
         halves = np.stack([self.codes >> 4, self.codes & _LEVELS], axis=2).reshape(len(self.codes), -1)
         values = halves[:, : self.dimensions].astype(np.float32)
         return unit_rows(self.low + (self.high - self.low) / _LEVELS * values)
 
 
 def quantize(descriptors: Descriptors) -> Quantized:
-    """Round descriptors to four bits a dimension; there must be one."""
+    """Round descriptors to four bits per dimension; at least one descriptor is required."""
     low, high = float(descriptors.min()), float(descriptors.max())
     steps = (descriptors - low) * (_LEVELS / max(high - low, 1e-12))
     codes = np.round(steps).astype(np.uint8)
@@ -69,7 +68,7 @@ def quantize(descriptors: Descriptors) -> Quantized:
 
 
 def pack(rows: Descriptors) -> dict[str, np.ndarray]:
-    """Rows of unit length as arrays to store, quantized and compressed; there must be one."""
+    """Quantize and compress rows of unit length to arrays for a file; at least one row is required."""
     quantized = quantize(rows)
     packed = lzma.compress(quantized.codes.tobytes(), filters=_FILTERS)
     return {
@@ -80,10 +79,10 @@ def pack(rows: Descriptors) -> dict[str, np.ndarray]:
 
 
 def unpack(arrays: Mapping[str, np.ndarray], count: int) -> Descriptors:
-    """The rows again, of which there must be so many.
+    """Restore `count` rows from the arrays of `pack`.
 
     Raises:
-        ValueError: There are more or fewer; damaged arrays raise any of `UNREADABLE`.
+        ValueError: The arrays hold another number of rows. Damaged arrays raise any of `UNREADABLE`.
     """
     codes = np.frombuffer(lzma.decompress(arrays["codes"].tobytes()), np.uint8)
     (low, high), dimensions = arrays["range"].tolist(), int(arrays["dimensions"])
@@ -93,8 +92,8 @@ def unpack(arrays: Mapping[str, np.ndarray], count: int) -> Descriptors:
 
 
 def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
-    """Write descriptors of points, quantized and packed."""
-    steps = np.diff(points.points, prepend=-1).astype(np.uint32)  # mostly 1, which packs well
+    """Write descriptors of points, quantized and compressed."""
+    steps = np.diff(points.points, prepend=-1).astype(np.uint32)  # mostly 1, which compresses well
     arrays: dict[str, Any] = pack(points.descriptors)
     arrays["points"] = np.frombuffer(lzma.compress(steps.tobytes()), np.uint8)
     if points.directions is not None:
@@ -106,17 +105,17 @@ def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
 
 
 def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
-    """Read descriptors of the points of a model.
+    """Read descriptors of points of a model with `num_points` points.
 
     Raises:
-        InputError: The file is damaged, or of another model.
+        InputError: The file is damaged, or belongs to another model.
     """
     try:
         with path.open("rb") as opened, np.load(opened) as file:
             steps = np.frombuffer(lzma.decompress(file["points"].tobytes()), np.uint32)
             points = np.cumsum(steps, dtype=np.int64) - 1
             if not len(points) or points[-1] >= num_points or not steps.all():
-                raise ValueError(f"its rows are not those of {num_points} points")
+                raise ValueError(f"its rows do not belong to {num_points} points")
             return PointDescriptors(
                 points=points,
                 descriptors=unpack(file, len(points)),
@@ -124,7 +123,7 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
                 distinct=_unpack_bits(file["distinct"], len(points)) if "distinct" in file else None,
             )
     except UNREADABLE as error:
-        raise InputError(f"{path}: damaged ({error}); make the map again with `slimsfm reduce`") from error
+        raise InputError(f"{path}: damaged ({error}); reduce the full map again") from error
 
 
 def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[np.ndarray, "n 3"]:
@@ -133,20 +132,20 @@ def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[
 
 def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
     if len(packed) != (count + 7) // 8:
-        raise ValueError(f"{len(packed)} bytes do not hold a bit of each of {count} points")
+        raise ValueError(f"{len(packed)} bytes do not hold one bit per point for {count} points")
     return np.unpackbits(packed, count=count).astype(bool)
 
 
 def with_global_descriptors(map: Map) -> Map:
-    """The map with a global descriptor of each reference image."""
+    """Add a global descriptor per reference image to a map."""
     return replace(map, global_descriptors=describe_images(map))
 
 
 def describe_images(map: Map, seed: int = 0) -> GlobalDescriptors:
-    """A global descriptor of each reference image.
+    """Compute a global descriptor (VLAD) per reference image.
 
-    Words are learned from the map's own descriptors, and only keypoints that see a point of the map count:
-    what is not in the map must not make a query resemble it. O(observations).
+    The vocabulary is learned from the map's own descriptors. Only keypoints that observe a point count, so
+    that background outside the map does not make images similar. O(observations).
     """
     words = learn_words(np.concatenate([_seen(map, name)[:_SAMPLE] for name in map.images]), seed)
     rows = np.stack([vlad(_seen(map, name), words) for name in map.images])
@@ -158,7 +157,7 @@ def _seen(map: Map, name: str) -> Descriptors:
 
 
 def write_global_descriptors(path: Path, global_descriptors: GlobalDescriptors) -> None:
-    """Write global descriptors: half a byte a value, as descriptors of points are."""
+    """Write global descriptors, quantized and compressed like those of points."""
     with path.open("wb") as file:
         arrays: dict[str, Any] = {
             "words": global_descriptors.vocabulary,
@@ -168,16 +167,16 @@ def write_global_descriptors(path: Path, global_descriptors: GlobalDescriptors) 
 
 
 def read_global_descriptors(path: Path, num_images: int) -> GlobalDescriptors:
-    """Read global descriptors of so many images.
+    """Read global descriptors of `num_images` images.
 
     Raises:
-        InputError: The file is damaged, or of another map.
+        InputError: The file is damaged, or belongs to another map.
     """
     try:
         with path.open("rb") as opened, np.load(opened) as file:
             words, rows = file["words"].astype(np.float32), unpack(file, num_images)
         if words.ndim != 2 or rows.shape[1] != words.size:
-            raise ValueError(f"rows of {rows.shape[1]} values do not fit words of shape {words.shape}")
+            raise ValueError(f"rows of {rows.shape[1]} values do not match words of shape {words.shape}")
         return GlobalDescriptors(vocabulary=words, descriptors=rows)
     except UNREADABLE as error:
         raise InputError(f"{path}: damaged ({error}); build or import the map again") from error

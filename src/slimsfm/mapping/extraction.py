@@ -1,4 +1,9 @@
-"""What photos tell."""
+"""Cameras, local features and colors of a folder of photos.
+
+`redescribe` computes SIFT descriptors at the keypoints of an existing model. A model stores the positions of
+keypoints but not their scales and orientations. These are taken from the nearest detected SIFT feature within
+two pixels. A keypoint without one gets a descriptor of zeros, which matches nothing.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,16 +30,17 @@ Colors = Mapping[str, UInt8[np.ndarray, "n 3"]]
 """RGB at each keypoint, by image name."""
 
 _REACH_PX = 2.0
-_MIN_DESCRIBED = 0.2  # share of observations; fewer and the keypoints are of another kind or other images
+_MIN_DESCRIBED = 0.2  # share of observations; with fewer, detector or images are others
 
 
 def guess_cameras(images: Path, names: list[str], sharing: CameraSharing) -> dict[str, pycolmap.Camera]:
-    """Guess the camera of each image from EXIF; images with equal `camera_id` share one.
+    """Guess the camera of each image from EXIF; images with equal `camera_id` share a camera.
 
-    "auto" puts images of equal size and focal length together, "shared" all, "per-image" none.
+    With "auto", images of equal size and focal length share a camera; with "shared" all do, with "per-image"
+    none.
 
     Raises:
-        InputError: An image cannot be read, or images of several sizes should share one camera.
+        InputError: An image cannot be read, or images of different sizes share a camera.
     """
     guesses = {name: camera_from_exif(images / name) for name in names}
     if sharing == "shared":
@@ -59,8 +65,8 @@ def _check_equal_sizes(guesses: dict[str, pycolmap.Camera]) -> None:
     if len(sizes) > 1:
         (size_a, a), (size_b, b) = list(sizes.items())[:2]
         raise InputError(
-            f"--camera shared: {a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
-            "images of one camera have one size, so use --camera auto"
+            f"{a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
+            "images that share a camera must have the same size, so let the cameras be 'auto'"
         )
 
 
@@ -72,10 +78,10 @@ def extract_features(
     output: Path,
     progress: ProgressBar,
 ) -> tuple[FeatureFile, Colors]:
-    """Extract the features of images into a file.
+    """Extract the features of images to a file.
 
     Raises:
-        InputError: An image cannot be read, or its mask is missing or of another size.
+        InputError: An image cannot be read, or its mask is unreadable or of another size.
     """
     colors = {}
     with FeatureWriter(output) as writer:
@@ -88,11 +94,12 @@ def extract_features(
 
 
 def mask_of(masks: Path | None, name: str, shape: tuple[int, ...]) -> GrayImage | None:
-    """The mask of an image as COLMAP names it; an image without one is used whole, as COLMAP does.
+    """The mask of an image, NAME.png as in COLMAP; None for an image without a mask, which is used whole.
 
     Raises:
-        InputError: There is no such folder, or the mask cannot be read or is of another size.
+        InputError: The folder does not exist, or the mask is unreadable or of another size.
     """
+    masks = Path(masks) if masks else None
     if masks is not None and not masks.is_dir():
         raise InputError(f"{masks}: no such folder of masks")
     path = masks / f"{name}.png" if masks else None
@@ -105,7 +112,7 @@ def mask_of(masks: Path | None, name: str, shape: tuple[int, ...]) -> GrayImage 
 
 
 def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
-    """Give each point the mean colour of its observations."""
+    """Set the color of each point to the mean color of its observations."""
     names = {image_id: image.name for image_id, image in model.images.items()}
     for point in model.points3D.values():
         seen = [colors[names[element.image_id]][element.point2D_idx] for element in point.track.elements]
@@ -115,11 +122,14 @@ def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
 def redescribe(
     posed_images: list[pycolmap.Image], folder: Path, progress: ProgressBar
 ) -> tuple[dict[str, Features], Sift]:
-    """Describe the keypoints of images; returns the features by name and the extractor for queries.
+    """Describe the keypoints of a model's images by SIFT.
+
+    Returns:
+        The features by image name, and the extractor for queries.
 
     Raises:
         ImageError: An image is missing, unreadable or of another size than its camera.
-        ModelError: Hardly a keypoint that sees a point could be described.
+        ModelError: Fewer than 20 % of the keypoints that observe a point could be described.
     """
     extractor = Sift()
     features = {}
@@ -132,7 +142,7 @@ def redescribe(
     if described < _MIN_DESCRIBED * observations:
         raise ModelError(
             f"{folder}: SIFT features lie at only {described} of the {observations} keypoints that see a "
-            "point; are these the model's images? Else give its own features with --features or --database"
+            "point; give the images of this model or, if it does not use SIFT, its feature file or database"
         )
     return features, extractor
 
@@ -144,7 +154,7 @@ def _redescribe_image(image: pycolmap.Image, path: Path, extractor: Sift) -> Fea
     if (width, height) != (camera.width, camera.height):
         raise ImageError(
             f"{path}: {width}x{height} pixels, but its camera in the model has "
-            f"{camera.width}x{camera.height}; give the images that the model was made of"
+            f"{camera.width}x{camera.height}; give the images that the model was made from"
         )
     keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -174,7 +184,7 @@ def _describe(
     for row in rows:
         one = detected[nearest[row]]
         x, y = (keypoints[row] - 0.5).tolist()
-        # OpenCV may drop or reorder keypoints: the row travels along as the class.
+        # OpenCV may drop or reorder keypoints; class_id keeps the row.
         wanted.append(cv2.KeyPoint(x, y, one.size, one.angle, one.response, one.octave, int(row)))
     computed, found = detector.compute(gray, wanted)
     if found is not None:
