@@ -187,3 +187,26 @@ def test_descriptors_need_not_be_of_unit_length_to_be_written(exact, chosen, tmp
     read = read_map(tmp_path / "map").point_descriptors.descriptors
     assert read == pytest.approx(unit_rows(read))
     assert (read * chosen.descriptors).sum(axis=1).min() > 1 - HALF_A_STEP
+
+
+def test_a_map_says_what_it_was_reduced_to(exact, chosen, direct):
+    few = keep_images(exact, list(exact.images)[:1])
+    joined = with_points(few, exact, chosen)
+    kinds = [one.kind for one in (exact, direct, few, joined)]
+    assert kinds == ["full", "points", "images", "images and points"]
+    points, images = len(chosen.points), len(exact.images)
+    origin = f"({exact.info.origin})"
+    assert direct.describe() == f"{points} points for direct matching, reduced from {images} images {origin}"
+    assert exact.describe() == f"{images} images with {len(exact.point3D_ids)} points {origin}"
+    reduced = f"reduced from a larger map {origin}"
+    assert few.describe() == f"1 image with {len(few.point3D_ids)} points, {reduced}"
+    assert joined.describe() == (
+        f"1 image with {len(joined.point3D_ids)} points, {points} of them for direct matching, {reduced}"
+    )
+
+
+def test_the_kind_survives_writing_and_reading(exact, chosen, direct, tmp_path):
+    few = keep_images(exact, list(exact.images)[:1])
+    for number, one in enumerate((exact, direct, few, with_points(few, exact, chosen))):
+        write_map(one, str(tmp_path / str(number)))
+        assert read_map(str(tmp_path / str(number))).describe() == one.describe()

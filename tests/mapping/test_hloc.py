@@ -160,13 +160,13 @@ def test_floats_stay_as_they_are(exported):
 def test_an_import_of_the_export_is_the_map_again(exported):
     map_, path = exported.map, exported.path
     files = ImportOptions(features=path / "features.h5", matches=path / "matches.h5")
-    back = import_colmap(path / "sfm", files)
+    back = import_colmap(path / "sfm", options=files)
     for (a, b), pairs in map_.matches.items():
         assert np.array_equal(back.matches[a, b], pairs)
     for name, features in map_.features.items():
         assert np.allclose(back.features[name].keypoints, features.keypoints, atol=1e-4)
         assert np.array_equal(back.features[name].descriptors, features.descriptors)
-    boxed = replace(back, info=replace(back.info, box=map_.box))  # hloc knows no box: it is estimated anew
+    boxed = replace(back, info=replace(back.info, box=map_.box))  # hloc stores no box
     assert boxed.fingerprint == map_.fingerprint
 
 
@@ -290,7 +290,7 @@ def test_names_of_queries_are_read_from_folders_and_lists(tmp_path):
     [
         (None, "neither a folder of images nor a readable list"),
         (b"\x89PNG\xff\xfe", "neither a folder of images nor a readable list"),
-        (b"# none\n\n", "names no query"),
+        (b"# none\n\n", "holds no name of a query"),
         (b"a.png\nmy photo.png\n", "'my photo.png' is neither a name without spaces nor"),
     ],
     ids=["missing", "an image", "empty", "a name with a space"],

@@ -58,8 +58,8 @@ def test_a_map_is_read_as_it_was_written(exact, written):
 
 
 def test_a_built_map_is_read_as_it_was_written(unposed, tmp_path):
-    write_map(unposed.build.map, tmp_path / "map")
-    assert_equal(unposed.build.map, read_map(tmp_path / "map"))
+    write_map(unposed.map, tmp_path / "map")
+    assert_equal(unposed.map, read_map(tmp_path / "map"))
 
 
 def test_equal_maps_are_equal_files(exact, written, tmp_path):

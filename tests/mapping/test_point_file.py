@@ -93,7 +93,7 @@ def test_a_file_cut_short_anywhere_is_refused(written):
     whole = written.read_bytes()
     for end in range(0, len(whole), 37):
         written.write_bytes(whole[:end])
-        with pytest.raises(InputError, match=r"points.npz: damaged .*make the map again"):
+        with pytest.raises(InputError, match=r"points.npz: damaged .*reduce the full map again"):
             read_point_descriptors(written, 80)
 
 
@@ -112,7 +112,7 @@ def test_a_file_with_a_bad_byte_is_read_as_it_was_or_refused(written):
 
 @pytest.mark.parametrize("num_points", [0, 1, 78])
 def test_a_file_of_another_model_is_refused(written, num_points):
-    with pytest.raises(InputError, match=f"not those of {num_points} points"):
+    with pytest.raises(InputError, match=f"do not belong to {num_points} points"):
         read_point_descriptors(written, num_points)
     assert len(read_point_descriptors(written, 79).points) == 40
 
@@ -160,6 +160,6 @@ def test_a_map_with_damaged_points_names_their_file(exact, tmp_path, kind):
             np.save(file, points)
     else:
         path.write_bytes({"text": b"no points here", "nothing": b""}.get(kind, whole[: len(whole) // 2]))
-    with pytest.raises(MapError, match=r"points.npz: damaged .*make the map again") as refusal:
+    with pytest.raises(MapError, match=r"points.npz: damaged .*reduce the full map again") as refusal:
         read_map(tmp_path / "map")
     assert str(path) in str(refusal.value)

@@ -88,7 +88,7 @@ def test_the_map_itself_is_not_changed(tmp_path):
 def test_unknown_names_and_no_name_are_input_errors():
     with pytest.raises(InputError, match=r"'missing\.png' is not in the map"):
         keep_images(PARTIAL, [NAMES[0], "missing.png"])
-    with pytest.raises(InputError, match="no image was chosen"):
+    with pytest.raises(InputError, match="no image to keep was given"):
         keep_images(PARTIAL, [])
 
 
