@@ -1,4 +1,4 @@
-"""Maps in hloc's layout, read back by hloc's conventions as they are written down here."""
+"""Maps in hloc's layout, read by hloc's conventions."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ NAMES = ["cam 1/front view.png", "cam 1/side.png", "cam-2/a/1.png", "cam-2/a/2.p
 
 
 def hloc_pairs(path):
-    """A pair is a line of two words; a query's references are those it is paired with."""
+    """Pairs are lines of two words; returns the references of each query."""
     references = {}
     for line in path.read_text().rstrip("\n").split("\n"):
         query, reference = line.split()
@@ -31,13 +31,13 @@ def hloc_pairs(path):
 
 
 def hloc_keypoints_in_colmap(path, name):
-    """hloc's origin is the centre of the top-left pixel, COLMAP's that pixel's corner."""
+    """hloc's origin is the center of the top-left pixel, COLMAP's is its corner."""
     with h5py.File(path, "r", libver="latest") as file:
         return file[name]["keypoints"][()] + 0.5
 
 
 def hloc_matches(path, name0, name1):
-    """A group `A/B` or `B/A`, "/" in names written "-"; -1 is no match."""
+    """A group `A/B` or `B/A`, "/" in names written "-"; -1 marks no match."""
     keys = [name.replace("/", "-") for name in (name0, name1)]
     with h5py.File(path, "r", libver="latest") as file:
         turned = "/".join(keys) not in file
@@ -50,7 +50,7 @@ def hloc_matches(path, name0, name1):
 
 
 def hloc_nearest(path0, name0, path1, name1):
-    """Mutual nearest neighbours by the dot product of descriptors as they are stored."""
+    """Mutual nearest neighbors by the dot product of stored descriptors."""
     with h5py.File(path0, "r") as file0, h5py.File(path1, "r") as file1:
         one, other = file0[name0]["descriptors"][()], file1[name1]["descriptors"][()]
     similar = np.einsum("dn,dm->nm", one.astype(np.float32), other.astype(np.float32))
@@ -129,7 +129,7 @@ def test_features_have_hlocs_shapes(exported):
             assert group["image_size"][()].tolist() == [640, 480]
 
 
-def test_matches_are_found_either_way_around(exported):
+def test_matches_are_found_in_both_orders_of_a_pair(exported):
     for (a, b), pairs in exported.map.matches.items():
         assert np.array_equal(hloc_matches(exported.path / "matches.h5", a, b), pairs)
         turned = hloc_matches(exported.path / "matches.h5", b, a)
@@ -157,7 +157,7 @@ def test_floats_stay_as_they_are(exported):
             assert np.array_equal(file[name]["descriptors"][()].T, features.descriptors)
 
 
-def test_an_import_of_the_export_is_the_map_again(exported):
+def test_importing_the_export_restores_the_map(exported):
     map_, path = exported.map, exported.path
     files = ImportOptions(features=path / "features.h5", matches=path / "matches.h5")
     back = import_colmap(path / "sfm", options=files)
@@ -184,13 +184,13 @@ def test_every_query_is_paired_with_every_image(exact, tmp_path):
     assert list(paired) == ["night/2.jpg", "night/1.jpg"]
 
 
-def test_a_map_without_matches_gets_none(exact, tmp_path):
+def test_a_map_without_matches_is_exported_without_matches(exact, tmp_path):
     write_hloc(replace(exact, matches={}), tmp_path / "out")
     assert not (tmp_path / "out" / "matches.h5").exists()
 
 
 def localize_as_hloc(path, model, query, camera, features, matches):
-    """What hloc's `localize_sfm` does: 2D-3D matches by way of the references, then a pose."""
+    """Localize like hloc's `localize_sfm`: 2D-3D matches through the references, then a pose."""
     keypoints = hloc_keypoints_in_colmap(features, query)
     ids = {image.name: image_id for image_id, image in model.images.items()}
     found = {}
@@ -295,7 +295,7 @@ def test_names_of_queries_are_read_from_folders_and_lists(tmp_path):
     ],
     ids=["missing", "an image", "empty", "a name with a space"],
 )
-def test_lists_that_are_none_are_refused(tmp_path, content, complaint):
+def test_files_that_are_not_lists_of_queries_are_refused(tmp_path, content, complaint):
     path = tmp_path / "names.txt"
     if content is not None:
         path.write_bytes(content)

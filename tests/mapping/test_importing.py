@@ -63,7 +63,7 @@ def write_hloc(folder, map_, wrong=0):
 
 @dataclass(frozen=True)
 class Project:
-    """COLMAP's project of a built map: model, database, hloc's files."""
+    """The COLMAP project of a built map: model, database and hloc's files."""
 
     folder: Path
     model: Path
@@ -98,7 +98,7 @@ def poses_of_queries(map_):
 
 
 @pytest.mark.parametrize("kind", ["new binary", "new text", "old binary", "old text"])
-def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, posed, tmp_path, kind):
+def test_an_imported_model_localizes_like_the_map_that_it_came_from(project, posed, tmp_path, kind):
     model = tmp_path / "model"
     model.mkdir()
     original = posed.map
@@ -124,7 +124,7 @@ def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, po
     assert np.array_equal(poses_of_queries(read_map(tmp_path / "map")), poses_of_queries(map_))
 
 
-def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable):
+def test_the_database_is_found_where_colmap_puts_it_and_not_changed(editable):
     before = rows_of(editable.folder / "database.db")
     map_ = import_colmap(editable.model)
     assert len(map_.matches) > 5
@@ -134,7 +134,7 @@ def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable)
     assert [path.name for path in editable.folder.glob("database*")] == ["database.db"]
 
 
-def test_a_model_without_a_database_says_what_else_there_is(editable):
+def test_without_a_database_the_error_names_other_sources(editable):
     (editable.folder / "database.db").unlink()
     with pytest.raises(
         InputError, match=r"no database\.db next to the model.*database.*features.*folder of images"
@@ -181,7 +181,7 @@ def test_features_of_another_run_are_a_model_error(editable):
         import_colmap(editable.model, options=ImportOptions(features=path))
 
 
-def test_files_of_hloc_give_the_same_poses_and_their_wrong_matches_go(project, posed):
+def test_hloc_files_give_the_same_poses_and_wrong_matches_are_removed(project, posed):
     options = ImportOptions(features=project.folder / "features.h5", matches=project.folder / "matches.h5")
     map_, original = import_colmap(project.model, options=options), posed.map
     for name in original.images:
@@ -199,7 +199,7 @@ def test_files_of_hloc_give_the_same_poses_and_their_wrong_matches_go(project, p
     assert wrong < 0.15 * 60 * len(original.matches)
 
 
-def test_matches_of_keypoints_that_are_not_there_are_named(editable):
+def test_matches_of_missing_keypoints_are_named(editable):
     with h5py.File(editable.folder / "matches.h5", "r+") as file:
         next(iter(next(iter(file.values())).values()))["matches0"][0] = 30_000
     options = ImportOptions(features=editable.folder / "features.h5", matches=editable.folder / "matches.h5")
@@ -207,7 +207,7 @@ def test_matches_of_keypoints_that_are_not_there_are_named(editable):
         import_colmap(editable.model, options=options)
 
 
-def test_features_without_matches_give_a_map_without(project):
+def test_features_without_matches_give_a_map_without_matches(project):
     map_ = import_colmap(project.model, options=ImportOptions(features=project.folder / "features.h5"))
     assert map_.matches == {}
 
@@ -259,14 +259,14 @@ def test_a_model_without_points_is_a_model_error(project, tmp_path):
         import_colmap(tmp_path, options=ImportOptions(database=project.folder / "database.db"))
 
 
-def test_a_given_box_is_taken(project, rendered, tmp_path):
+def test_a_given_box_is_used(project, rendered, tmp_path):
     np.savetxt(tmp_path / "box3d_corners.txt", rendered.known.box.corners)
     map_ = import_colmap(project.model, options=ImportOptions(box=tmp_path / "box3d_corners.txt"))
     assert map_.info.box_source == "given"
     assert map_.box.diagonal == pytest.approx(rendered.known.box.diagonal)
 
 
-def test_one_source_of_descriptors_is_enough():
+def test_two_sources_of_descriptors_are_refused():
     path = Path("x")
     with pytest.raises(ValueError, match="database and images: give only one"):
         ImportOptions(database=path, images=path)

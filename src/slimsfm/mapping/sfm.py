@@ -22,8 +22,8 @@ from slimsfm.progress import ProgressBar, counted, silent, single_step
 _JITTER_PX, _ON_GRID = 0.05, 1e-3  # pixels
 _BLOCK = 200  # pairs that COLMAP matches per call
 
-# COLMAP cannot read the photos, because its database names them by numbers; we color points ourselves. After a
-# good model it tries others, of the few remaining images.
+# COLMAP cannot read the photos, because its database names them by numbers; we color points ourselves. After
+# a good model it tries others, of the few remaining images.
 _EXPECTED_WARNINGS = re.compile(r"Could not read image|Requested to use GPU|Discarding reconstruction")
 _LOGGER = logging.getLogger(__name__)
 
