@@ -32,6 +32,11 @@ def test_without_a_terminal_start_and_end_of_a_stage_are_lines_with_counts_and_s
     assert re.fullmatch(r"match pairs: 28 of 28 in \d+\.\d s", last)
 
 
+def test_an_empty_loop_shows_nothing(capsys):
+    assert list(shown([], "localize")) == []
+    assert capsys.readouterr() == ("", "")
+
+
 def test_without_a_terminal_lines_inside_a_stage_have_rate_and_time_left(capsys):
     for item in PlainLines(interval_s=0.1)(range(4), "localize"):
         time.sleep(0.4 if item == 3 else 0.01)

@@ -34,7 +34,9 @@ def silent(items: Sequence[Item], label: str) -> Iterator[Item]:  # noqa: ARG001
 
 
 def shown(items: Sequence[Item], label: str) -> Iterator[Item]:
-    """Show progress on standard error: a bar on a terminal, otherwise plain lines."""
+    """Show progress on standard error: a bar on a terminal, otherwise plain lines; nothing for an empty loop."""
+    if len(items) == 0:
+        return iter(items)
     bars = _terminal_bars()
     return bars(items, label) if bars.console.is_terminal else PlainLines()(items, label)
 

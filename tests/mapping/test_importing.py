@@ -270,7 +270,7 @@ def test_two_sources_of_descriptors_are_refused():
     path = Path("x")
     with pytest.raises(ValueError, match="database and images: give only one"):
         ImportOptions(database=path, images=path)
-    with pytest.raises(ValueError, match="matches requires features"):
+    with pytest.raises(ValueError, match="matches needs features"):
         ImportOptions(matches=path)
 
 

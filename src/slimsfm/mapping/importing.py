@@ -51,7 +51,7 @@ class ImportOptions:
         if len(given) > 1:
             raise ValueError(f"{' and '.join(given)}: give only one source of descriptors")
         if self.matches is not None and self.features is None:
-            raise ValueError("matches requires features, which hold the matched keypoints")
+            raise ValueError("matches needs features, which hold the matched keypoints")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
