@@ -24,7 +24,7 @@ from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions
-from slimsfm.mapping.direct import direct_map
+from slimsfm.mapping.subset import direct_map
 from slimsfm.synthetic.objects import OBJECTS
 
 KEPT = (1.0, 0.25, 0.08)  # shares of the keypoints of a query

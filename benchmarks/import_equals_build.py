@@ -48,7 +48,7 @@ def compare(folder: Path, temporary: Path) -> None:
     references.mkdir()
     for name in set(names) - set(queries):
         os.symlink(folder / name, references / name)
-    built = build_map(references, temporary / "build", progress=shown).map
+    built = build_map(references, workspace=temporary / "build", progress=shown)
     slim = reduce_map(built, compute_graph(built, progress=shown).graph).map
     cameras = dict.fromkeys(queries, built.shared_camera)
     expected = localize(slim, folder, cameras)

@@ -9,10 +9,11 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmark_scenes import rendered
 from PIL import Image as PilImage
 from PIL import ImageDraw, ImageFont
+from slimsfm.synthetic.film import Film, film
 
+from benchmark_scenes import rendered
 from slimsfm.arrays import Image
 from slimsfm.files import replacing
 from slimsfm.localization import Localizer
@@ -21,7 +22,6 @@ from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.report.frames import draw_box
 from slimsfm.report.query_video import FRAMES_PER_SECOND
-from slimsfm.synthetic.film import Film, film
 from slimsfm.tracking import Tracked, Tracker
 from tracking import slim_map
 

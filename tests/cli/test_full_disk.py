@@ -8,6 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from commands import without_progress
+
 needs_root = pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() != 0 or shutil.which("mount") is None,
     reason="needs root, to mount a small disk",
@@ -32,7 +34,7 @@ def refused_for_space(*arguments):
     found = subprocess.run(
         [sys.executable, "-m", "slimsfm", *map(str, arguments)], capture_output=True, text=True
     )
-    lines = [line for line in found.stderr.splitlines() if line.strip()]
+    lines = [line for line in without_progress(found.stderr).splitlines() if line.strip()]
     assert (found.returncode, len(lines)) == (2, 1), found.stderr
     assert "No space left on device" in lines[0]
     return lines[0]

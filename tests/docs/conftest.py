@@ -74,7 +74,7 @@ def projects(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What is made of the photos: `map`, COLMAP's `project/`, hloc's `outputs/` and `queries.txt`, a box."""
     folder = tmp_path_factory.mktemp("projects")
     with quiet():
-        made = build_map(filmed / "photos", folder / "work").map
+        made = build_map(filmed / "photos", workspace=folder / "work")
     write_map(made, folder / "map")
     shutil.copytree(folder / "map" / "sparse", folder / "project" / "sparse" / "0")
     shutil.copytree(filmed / "photos", folder / "project" / "images")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from slimsfm.domination import exact, random_greedy
-from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.evaluation import scores
+from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions

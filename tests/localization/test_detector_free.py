@@ -149,7 +149,7 @@ def test_from_photos_by_way_of_the_disk_to_a_pose(folder, tmp_path, monkeypatch)
     )
     options = BuildOptions(extractor="loftr", max_image_size=320)
     with quiet():
-        write_map(build_map(folder, tmp_path / "work", options, known).map, tmp_path / "map")
+        write_map(build_map(folder, options, known=known), tmp_path / "map")
     map_ = read_map(tmp_path / "map")
     assert map_.info.extractor_options == {"max_image_size": 320, "weights": "loftr"}
     assert map_.photos[NAMES[0]].shape == (240, 320, 3)

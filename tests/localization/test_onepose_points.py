@@ -8,9 +8,8 @@ from slimsfm.errors import MapError
 from slimsfm.geometry import Box
 from slimsfm.localization.onepose_points import OnePosePointsOptions, prepare_points
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import Map
-from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.subset import direct_map, keep_images
 
 
 @pytest.fixture(scope="module")

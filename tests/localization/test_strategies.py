@@ -18,8 +18,8 @@ from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
 from slimsfm.localization.localizer import load_strategy
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Strategy, unite
-from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.map import Map
+from slimsfm.mapping.subset import direct_map, with_points
 from strategies import CLASSICAL
 
 TENTH_OF_A_PER_MILLE = 1e-4

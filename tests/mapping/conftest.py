@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from slimsfm.mapping.build import Build, BuildOptions, KnownPoses, build_map
+from slimsfm.mapping.build import KnownPoses, build_map
+from slimsfm.mapping.map import Map
 from slimsfm.synthetic.objects import OBJECTS
 from slimsfm.synthetic.scene import Take, mapping_take, object_box
 
@@ -13,7 +14,7 @@ NUM_FRAMES = 8
 
 @dataclass(frozen=True)
 class Rendered:
-    """Eight frames of a video of a printed box, on disk."""
+    """Eight frames of a video of a printed box, as files."""
 
     folder: Path
     take: Take
@@ -33,7 +34,7 @@ class Rendered:
 
 @dataclass(frozen=True)
 class Built:
-    build: Build
+    map: Map
     workspace: Path
 
 
@@ -52,11 +53,11 @@ def rendered(tmp_path_factory) -> Rendered:
 def unposed(rendered, tmp_path_factory) -> Built:
     """Built from the images alone."""
     workspace = tmp_path_factory.mktemp("unposed")
-    return Built(build_map(rendered.folder, workspace, BuildOptions()), workspace)
+    return Built(build_map(rendered.folder, workspace=workspace), workspace)
 
 
 @pytest.fixture(scope="session")
 def posed(rendered, tmp_path_factory) -> Built:
     """Built with the true poses."""
     workspace = tmp_path_factory.mktemp("posed")
-    return Built(build_map(rendered.folder, workspace, BuildOptions(), rendered.known), workspace)
+    return Built(build_map(rendered.folder, known=rendered.known, workspace=workspace), workspace)

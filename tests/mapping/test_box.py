@@ -39,30 +39,30 @@ SKEWED = (BOX.corners * [[3.0]] + np.eye(8, 3)).tolist()
         *(json.dumps(corners) for corners in (SEVEN, SKEWED, [[0, 0, 0]] * 8)),
     ],
 )
-def test_json_that_holds_no_box_is_an_input_error(tmp_path, text):
+def test_json_without_a_box_is_an_input_error(tmp_path, text):
     (tmp_path / "box.json").write_text(text)
-    with pytest.raises(InputError, match=r"box\.json: should hold the 8 corners"):
+    with pytest.raises(InputError, match=r"box\.json: must hold the 8 corners"):
         read_box(tmp_path / "box.json")
 
 
 @pytest.mark.parametrize(
     "text", ["", "\n\n", "hello", "1 2 3\n4 5", "1 2 3\n" * 8, "1 2 3\n", "\xff"], ids=repr
 )
-def test_text_that_holds_no_box_is_an_input_error(tmp_path, text):
+def test_text_without_a_box_is_an_input_error(tmp_path, text):
     (tmp_path / "box3d_corners.txt").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=r"box3d_corners\.txt: should hold the 8 corners"):
+    with pytest.raises(InputError, match=r"box3d_corners\.txt: must hold the 8 corners"):
         read_box(tmp_path / "box3d_corners.txt")
 
 
 def test_a_missing_box_and_a_folder_are_input_errors(tmp_path):
     with pytest.raises(InputError, match="no such box file"):
         read_box(tmp_path / "box.json")
-    with pytest.raises(InputError, match="should hold"):
+    with pytest.raises(InputError, match="must hold"):
         read_box(tmp_path)
 
 
 def scene(background, seed=0, world_from_box=None):
-    """A model of an object on a large ground; a share of its points lies around the object."""
+    """A model of an object on a large ground plane; a share of its points lies around the object."""
     rng = np.random.default_rng(seed)
     on_object = rng.uniform(-1, 1, (400, 3))
     on_object[np.arange(400), rng.integers(0, 3, 400)] = rng.choice([-1.0, 1.0], 400)  # the surface
@@ -88,7 +88,7 @@ def scene(background, seed=0, world_from_box=None):
 
 @pytest.mark.parametrize("background", [0.0, 0.1, 0.3])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_diagonal_is_estimated_in_spite_of_the_background(background, seed):
+def test_the_background_hardly_changes_the_estimated_diagonal(background, seed):
     box = estimate_box(scene(background, seed))
     assert box.diagonal == pytest.approx(BOX.diagonal, rel=0.25)
     assert np.linalg.norm(box.center) < 0.1 * BOX.diagonal
@@ -104,11 +104,11 @@ def test_the_box_moves_with_the_model():
     assert gaps.min(axis=1).max() < 1e-6
 
 
-def test_the_same_model_gives_the_same_box():
+def test_equal_models_give_equal_boxes():
     assert np.array_equal(estimate_box(scene(0.2)).corners, estimate_box(scene(0.2)).corners)
 
 
-def test_the_box_of_flat_points_has_a_little_thickness():
+def test_the_box_of_flat_points_has_some_thickness():
     model = scene(0.0)
     for point in model.points3D.values():
         point.xyz = point.xyz * [1, 1, 0]

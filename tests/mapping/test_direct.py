@@ -13,10 +13,9 @@ from slimsfm.geometry import corner_error
 from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map, with_points
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import PointDescriptors, check_map
-from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.subset import direct_map, keep_images, with_points
 from slimsfm.reduction import FrontierOptions, frontier
 
 HALF_A_STEP = 0.5 / 15  # of the range between the smallest and the largest value
@@ -39,7 +38,7 @@ def direct(exact, chosen):
 
 @pytest.fixture(scope="module")
 def partial():
-    """A map whose images see half of the points each."""
+    """A map whose images each observe half of the points."""
     return exact_map(8, 60, reach_deg=80)
 
 
@@ -52,7 +51,7 @@ def test_chosen_points_stay_as_they_were(exact, chosen, direct):
     assert np.array_equal(direct.point_descriptors.descriptors, chosen.descriptors)
 
 
-def test_images_keep_their_poses_and_nothing_to_match_them_by(exact, direct):
+def test_images_keep_their_poses_but_not_their_features(exact, direct):
     assert list(direct.images) == list(exact.images)
     for name, image in direct.images.items():
         before = exact.images[name]
@@ -65,13 +64,13 @@ def test_images_keep_their_poses_and_nothing_to_match_them_by(exact, direct):
     assert direct.info is exact.info
 
 
-def test_the_map_it_is_made_of_stays_whole(exact, chosen):
+def test_the_full_map_does_not_change(exact, chosen):
     before = exact.fingerprint
     direct_map(exact, chosen)
     assert replace(exact).fingerprint == before
 
 
-def test_it_is_read_as_it_was_written_but_for_rounding(direct, tmp_path):
+def test_a_direct_map_is_read_as_it_was_written_up_to_rounding(direct, tmp_path):
     write_map(direct, tmp_path / "map")
     assert sorted(path.name for path in (tmp_path / "map").iterdir()) == ["map.json", "points.npz", "sparse"]
     again = read_map(tmp_path / "map")
@@ -87,7 +86,7 @@ def test_it_is_read_as_it_was_written_but_for_rounding(direct, tmp_path):
     assert (after * before).sum(axis=1).min() > 0.98
 
 
-def test_equal_maps_are_equal_files_however_often_they_are_written(direct, tmp_path):
+def test_writing_twice_gives_equal_files(direct, tmp_path):
     for name in ("one", "two"):
         write_map(direct, tmp_path / name)
     write_map(read_map(tmp_path / "one"), tmp_path / "copy")
@@ -98,7 +97,7 @@ def test_equal_maps_are_equal_files_however_often_they_are_written(direct, tmp_p
             assert file.read_bytes() == (tmp_path / "copy" / place).read_bytes()
 
 
-def test_its_size_is_that_of_its_parts(exact, direct, tmp_path):
+def test_the_size_of_a_direct_map_is_the_sum_of_its_parts(exact, direct, tmp_path):
     write_map(exact, tmp_path / "full")
     write_map(direct, tmp_path / "direct")
     sizes = bytes_by_part(tmp_path / "direct")
@@ -115,7 +114,7 @@ def test_the_model_opens_in_pycolmap(direct, tmp_path):
     assert model.compute_num_observations() == 0
 
 
-def test_a_map_without_chosen_points_is_read_as_ever(exact, tmp_path):
+def test_a_map_without_chosen_points_is_read(exact, tmp_path):
     write_map(exact, tmp_path / "map")
     assert not (tmp_path / "map" / "points.npz").exists()
     again = read_map(tmp_path / "map")
@@ -134,7 +133,7 @@ def test_references_are_localized_where_they_are(direct, exact, tmp_path, strate
             assert corner_error(found.cam_from_world, image.cam_from_world(), exact.box) < 1e-4
 
 
-def test_points_added_to_some_images_serve_both_ways(partial, tmp_path):
+def test_points_added_to_some_images_serve_both_ways_of_matching(partial, tmp_path):
     names = list(partial.images)[:2]
     slim = keep_images(partial, names)
     chosen = described(partial, np.arange(1, len(partial.point3D_ids), 2))
@@ -158,7 +157,7 @@ def test_points_added_to_some_images_serve_both_ways(partial, tmp_path):
     assert slim.model.num_points3D() == len(slim.point3D_ids)
 
 
-def test_what_is_kept_of_a_map_for_both_is_for_images_again(partial):
+def test_keeping_images_of_a_map_for_both_ways_drops_the_points(partial):
     names = list(partial.images)
     both = with_points(keep_images(partial, names), partial, described(partial, [0, 5]))
     assert keep_images(both, names[:3]).point_descriptors is None
@@ -177,8 +176,8 @@ def test_what_is_kept_of_a_map_for_both_is_for_images_again(partial):
     ],
     ids=["auto", *EDGE_SOURCES, "exhaustive", "keep_images", "frontier"],
 )
-def test_what_needs_features_says_which_map_has_them(direct, use):
-    with pytest.raises(MapError, match=r"direct matching alone.*use the map that it was made of"):
+def test_errors_about_missing_features_name_the_map_that_has_them(direct, use):
+    with pytest.raises(MapError, match=r"direct matching alone.*use the map that it was reduced from"):
         use(direct)
 
 
@@ -188,3 +187,26 @@ def test_descriptors_need_not_be_of_unit_length_to_be_written(exact, chosen, tmp
     read = read_map(tmp_path / "map").point_descriptors.descriptors
     assert read == pytest.approx(unit_rows(read))
     assert (read * chosen.descriptors).sum(axis=1).min() > 1 - HALF_A_STEP
+
+
+def test_a_map_says_what_it_was_reduced_to(exact, chosen, direct):
+    few = keep_images(exact, list(exact.images)[:1])
+    joined = with_points(few, exact, chosen)
+    kinds = [one.kind for one in (exact, direct, few, joined)]
+    assert kinds == ["full", "points", "images", "images and points"]
+    points, images = len(chosen.points), len(exact.images)
+    origin = f"({exact.info.origin})"
+    assert direct.describe() == f"{points} points for direct matching, reduced from {images} images {origin}"
+    assert exact.describe() == f"{images} images with {len(exact.point3D_ids)} points {origin}"
+    reduced = f"reduced from a larger map {origin}"
+    assert few.describe() == f"1 image with {len(few.point3D_ids)} points, {reduced}"
+    assert joined.describe() == (
+        f"1 image with {len(joined.point3D_ids)} points, {points} of them for direct matching, {reduced}"
+    )
+
+
+def test_the_kind_survives_writing_and_reading(exact, chosen, direct, tmp_path):
+    few = keep_images(exact, list(exact.images)[:1])
+    for number, one in enumerate((exact, direct, few, with_points(few, exact, chosen))):
+        write_map(one, str(tmp_path / str(number)))
+        assert read_map(str(tmp_path / str(number))).describe() == one.describe()

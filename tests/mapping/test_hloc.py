@@ -1,4 +1,4 @@
-"""Maps in hloc's layout, read back by hloc's conventions as they are written down here."""
+"""Maps in hloc's layout, read by hloc's conventions."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,17 +13,16 @@ from slimsfm.errors import InputError, MapError, OutputError
 from slimsfm.features import unit_rows
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import corner_error
-from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.subset import Selection, keep_images
+from slimsfm.mapping.subset import FilteredMapping, direct_map, keep_images
 
 NAMES = ["cam 1/front view.png", "cam 1/side.png", "cam-2/a/1.png", "cam-2/a/2.png", "x y.png", "z.png"]
 
 
 def hloc_pairs(path):
-    """A pair is a line of two words; a query's references are those it is paired with."""
+    """Pairs are lines of two words; returns the references of each query."""
     references = {}
     for line in path.read_text().rstrip("\n").split("\n"):
         query, reference = line.split()
@@ -32,13 +31,13 @@ def hloc_pairs(path):
 
 
 def hloc_keypoints_in_colmap(path, name):
-    """hloc's origin is the centre of the top-left pixel, COLMAP's that pixel's corner."""
+    """hloc's origin is the center of the top-left pixel, COLMAP's is its corner."""
     with h5py.File(path, "r", libver="latest") as file:
         return file[name]["keypoints"][()] + 0.5
 
 
 def hloc_matches(path, name0, name1):
-    """A group `A/B` or `B/A`, "/" in names written "-"; -1 is no match."""
+    """A group `A/B` or `B/A`, "/" in names written "-"; -1 marks no match."""
     keys = [name.replace("/", "-") for name in (name0, name1)]
     with h5py.File(path, "r", libver="latest") as file:
         turned = "/".join(keys) not in file
@@ -51,7 +50,7 @@ def hloc_matches(path, name0, name1):
 
 
 def hloc_nearest(path0, name0, path1, name1):
-    """Mutual nearest neighbours by the dot product of descriptors as they are stored."""
+    """Mutual nearest neighbors by the dot product of stored descriptors."""
     with h5py.File(path0, "r") as file0, h5py.File(path1, "r") as file1:
         one, other = file0[name0]["descriptors"][()], file1[name1]["descriptors"][()]
     similar = np.einsum("dn,dm->nm", one.astype(np.float32), other.astype(np.float32))
@@ -130,7 +129,7 @@ def test_features_have_hlocs_shapes(exported):
             assert group["image_size"][()].tolist() == [640, 480]
 
 
-def test_matches_are_found_either_way_around(exported):
+def test_matches_are_found_in_both_orders_of_a_pair(exported):
     for (a, b), pairs in exported.map.matches.items():
         assert np.array_equal(hloc_matches(exported.path / "matches.h5", a, b), pairs)
         turned = hloc_matches(exported.path / "matches.h5", b, a)
@@ -158,16 +157,16 @@ def test_floats_stay_as_they_are(exported):
             assert np.array_equal(file[name]["descriptors"][()].T, features.descriptors)
 
 
-def test_an_import_of_the_export_is_the_map_again(exported):
+def test_importing_the_export_restores_the_map(exported):
     map_, path = exported.map, exported.path
     files = ImportOptions(features=path / "features.h5", matches=path / "matches.h5")
-    back = import_colmap(path / "sfm", files)
+    back = import_colmap(path / "sfm", options=files)
     for (a, b), pairs in map_.matches.items():
         assert np.array_equal(back.matches[a, b], pairs)
     for name, features in map_.features.items():
         assert np.allclose(back.features[name].keypoints, features.keypoints, atol=1e-4)
         assert np.array_equal(back.features[name].descriptors, features.descriptors)
-    boxed = replace(back, info=replace(back.info, box=map_.box))  # hloc knows no box: it is estimated anew
+    boxed = replace(back, info=replace(back.info, box=map_.box))  # hloc stores no box
     assert boxed.fingerprint == map_.fingerprint
 
 
@@ -185,13 +184,13 @@ def test_every_query_is_paired_with_every_image(exact, tmp_path):
     assert list(paired) == ["night/2.jpg", "night/1.jpg"]
 
 
-def test_a_map_without_matches_gets_none(exact, tmp_path):
+def test_a_map_without_matches_is_exported_without_matches(exact, tmp_path):
     write_hloc(replace(exact, matches={}), tmp_path / "out")
     assert not (tmp_path / "out" / "matches.h5").exists()
 
 
 def localize_as_hloc(path, model, query, camera, features, matches):
-    """What hloc's `localize_sfm` does: 2D-3D matches by way of the references, then a pose."""
+    """Localize like hloc's `localize_sfm`: 2D-3D matches through the references, then a pose."""
     keypoints = hloc_keypoints_in_colmap(features, query)
     ids = {image.name: image_id for image_id, image in model.images.items()}
     found = {}
@@ -237,17 +236,17 @@ def test_hlocs_localization_finds_the_true_poses(exact, tmp_path, stored):
 def test_a_map_for_direct_matching_is_refused(exact, tmp_path):
     rows = np.arange(5)
     points = PointDescriptors(points=rows, descriptors=np.eye(5, 32, dtype=np.float32))
-    with pytest.raises(MapError, match=r"direct matching alone.*slimsfm reduce MAP -o SMALL --for images"):
+    with pytest.raises(MapError, match=r"direct matching alone.*reduced for matching images"):
         write_hloc(direct_map(exact, points), tmp_path / "out")
     assert contents(tmp_path) == {}
 
 
 def test_pairs_that_hloc_would_misread_are_refused(exact, tmp_path):
-    with pytest.raises(InputError, match=r"'my query\.png': hloc reads no pair of a name with a space"):
+    with pytest.raises(InputError, match=r"'my query\.png': hloc cannot read pairs of names with spaces"):
         write_hloc(exact, tmp_path / "out", ["my query.png"])
-    with pytest.raises(InputError, match=r"'cam 1/front view\.png': hloc reads no pair"):
+    with pytest.raises(InputError, match=r"'cam 1/front view\.png': hloc cannot read pairs"):
         write_hloc(renamed(exact, NAMES), tmp_path / "out", ["query.png"])
-    with pytest.raises(InputError, match=r"query '003\.png' is called as an image of the map is"):
+    with pytest.raises(InputError, match=r"query '003\.png' has the name of an image of the map"):
         write_hloc(exact, tmp_path / "out", ["query.png", "003.png"])
     assert contents(tmp_path) == {}
 
@@ -263,7 +262,7 @@ def test_a_missing_part_leaves_nothing_behind(exact, tmp_path):
 
 
 def test_a_reduced_map_needs_no_features_of_dropped_images(exact, tmp_path):
-    kept = Selection(exact.features, {"002.png", "003.png"}.__contains__)
+    kept = FilteredMapping(exact.features, {"002.png", "003.png"}.__contains__)
     write_hloc(replace(keep_images(exact, list(kept)), features=kept), tmp_path / "out")
     with h5py.File(tmp_path / "out" / "features.h5", "r") as file:
         assert sorted(file) == ["002.png", "003.png"]
@@ -291,12 +290,12 @@ def test_names_of_queries_are_read_from_folders_and_lists(tmp_path):
     [
         (None, "neither a folder of images nor a readable list"),
         (b"\x89PNG\xff\xfe", "neither a folder of images nor a readable list"),
-        (b"# none\n\n", "names no query"),
+        (b"# none\n\n", "holds no name of a query"),
         (b"a.png\nmy photo.png\n", "'my photo.png' is neither a name without spaces nor"),
     ],
     ids=["missing", "an image", "empty", "a name with a space"],
 )
-def test_lists_that_are_none_are_refused(tmp_path, content, complaint):
+def test_files_that_are_not_lists_of_queries_are_refused(tmp_path, content, complaint):
     path = tmp_path / "names.txt"
     if content is not None:
         path.write_bytes(content)

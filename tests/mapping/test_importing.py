@@ -13,14 +13,14 @@ from PIL import Image
 from slimsfm.errors import ImageError, InputError, ModelError
 from slimsfm.features import unit_rows
 from slimsfm.localization.localizer import Localizer
-from slimsfm.mapping.importing import ImportOptions, _frames, import_colmap
+from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.photos import read_image
 from slimsfm.synthetic.scene import mapping_take
 
 
 def write_colmap_database(path, map_):
-    """The database that COLMAP would have left beside the model."""
+    """The database that COLMAP would have left next to the model."""
     with pycolmap.Database.open(path) as database:
         for camera in map_.model.cameras.values():
             database.write_camera(camera, use_camera_id=True)
@@ -63,7 +63,7 @@ def write_hloc(folder, map_, wrong=0):
 
 @dataclass(frozen=True)
 class Project:
-    """COLMAP's project of a built map: model, database, hloc's files."""
+    """The COLMAP project of a built map: model, database and hloc's files."""
 
     folder: Path
     model: Path
@@ -74,9 +74,9 @@ def project(posed, tmp_path_factory) -> Project:
     folder = tmp_path_factory.mktemp("project")
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
-    posed.build.map.model.write_binary(model)
-    write_colmap_database(folder / "database.db", posed.build.map)
-    write_hloc(folder, posed.build.map, wrong=60)
+    posed.map.model.write_binary(model)
+    write_colmap_database(folder / "database.db", posed.map)
+    write_hloc(folder, posed.map, wrong=60)
     return Project(folder, model)
 
 
@@ -98,15 +98,15 @@ def poses_of_queries(map_):
 
 
 @pytest.mark.parametrize("kind", ["new binary", "new text", "old binary", "old text"])
-def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, posed, tmp_path, kind):
+def test_an_imported_model_localizes_like_the_map_that_it_came_from(project, posed, tmp_path, kind):
     model = tmp_path / "model"
     model.mkdir()
-    original = posed.build.map
+    original = posed.map
     (original.model.write_text if "text" in kind else original.model.write_binary)(model)
     if "old" in kind:
         for path in [*model.glob("rigs.*"), *model.glob("frames.*")]:
             path.unlink()
-    map_ = import_colmap(model, ImportOptions(database=project.folder / "database.db"))
+    map_ = import_colmap(model, options=ImportOptions(database=project.folder / "database.db"))
     assert list(map_.images) == list(original.images)
     assert np.array_equal(map_.point3D_ids, original.point3D_ids)
     assert np.array_equal(map_.points3D_in_world, original.points3D_in_world)
@@ -124,7 +124,7 @@ def test_a_model_with_its_database_localizes_as_the_map_it_came_from(project, po
     assert np.array_equal(poses_of_queries(read_map(tmp_path / "map")), poses_of_queries(map_))
 
 
-def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable):
+def test_the_database_is_found_where_colmap_puts_it_and_not_changed(editable):
     before = rows_of(editable.folder / "database.db")
     map_ = import_colmap(editable.model)
     assert len(map_.matches) > 5
@@ -134,14 +134,14 @@ def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable)
     assert [path.name for path in editable.folder.glob("database*")] == ["database.db"]
 
 
-def test_a_model_without_a_database_says_what_else_there_is(editable):
+def test_without_a_database_the_error_names_other_sources(editable):
     (editable.folder / "database.db").unlink()
     with pytest.raises(
-        InputError, match=r"no database\.db beside the model.*--database.*--features.*--images"
+        InputError, match=r"no database\.db next to the model.*database.*features.*folder of images"
     ):
         import_colmap(editable.model)
     with pytest.raises(InputError, match="no such database"):
-        import_colmap(editable.model, ImportOptions(database=editable.folder / "database.db"))
+        import_colmap(editable.model, options=ImportOptions(database=editable.folder / "database.db"))
 
 
 @pytest.mark.parametrize("damage", ["text", "cut", "empty", "other"])
@@ -157,7 +157,7 @@ def test_a_database_of_other_images_is_a_model_error(editable, posed):
     path = editable.folder / "database.db"
     path.unlink()
     with pycolmap.Database.open(path) as database:
-        database.write_camera(posed.build.map.shared_camera)
+        database.write_camera(posed.map.shared_camera)
     with pytest.raises(ModelError, match=r"database\.db: has no descriptors of image 'take 1/frame 0\.png'"):
         import_colmap(editable.model)
 
@@ -174,16 +174,16 @@ def test_features_of_another_run_are_a_model_error(editable):
         del group["descriptors"]
         group["descriptors"] = shorter
     with pytest.raises(ModelError, match=r"frame 3\.png' has \d+ keypoints in the model but \d+ in the feat"):
-        import_colmap(editable.model, ImportOptions(features=path))
+        import_colmap(editable.model, options=ImportOptions(features=path))
     with h5py.File(path, "r+") as file:
         del file["take 1/frame 3.png"]
     with pytest.raises(ModelError, match=r"features\.h5: has no features of image 'take 1/frame 3\.png'"):
-        import_colmap(editable.model, ImportOptions(features=path))
+        import_colmap(editable.model, options=ImportOptions(features=path))
 
 
-def test_files_of_hloc_give_the_same_poses_and_their_wrong_matches_go(project, posed):
+def test_hloc_files_give_the_same_poses_and_wrong_matches_are_removed(project, posed):
     options = ImportOptions(features=project.folder / "features.h5", matches=project.folder / "matches.h5")
-    map_, original = import_colmap(project.model, options), posed.build.map
+    map_, original = import_colmap(project.model, options=options), posed.map
     for name in original.images:
         assert map_.features[name].descriptors.dtype == np.float16
         assert map_.features[name].keypoints == pytest.approx(original.features[name].keypoints, abs=1e-4)
@@ -199,27 +199,27 @@ def test_files_of_hloc_give_the_same_poses_and_their_wrong_matches_go(project, p
     assert wrong < 0.15 * 60 * len(original.matches)
 
 
-def test_matches_of_keypoints_that_are_not_there_are_named(editable):
+def test_matches_of_missing_keypoints_are_named(editable):
     with h5py.File(editable.folder / "matches.h5", "r+") as file:
         next(iter(next(iter(file.values())).values()))["matches0"][0] = 30_000
     options = ImportOptions(features=editable.folder / "features.h5", matches=editable.folder / "matches.h5")
     with pytest.raises(ModelError, match=r"matches\.h5.*keypoint"):
-        import_colmap(editable.model, options)
+        import_colmap(editable.model, options=options)
 
 
-def test_features_without_matches_give_a_map_without(project):
-    map_ = import_colmap(project.model, ImportOptions(features=project.folder / "features.h5"))
+def test_features_without_matches_give_a_map_without_matches(project):
+    map_ = import_colmap(project.model, options=ImportOptions(features=project.folder / "features.h5"))
     assert map_.matches == {}
 
 
 def test_keypoints_are_described_again_from_the_images(project, posed, rendered):
-    map_ = import_colmap(project.model, ImportOptions(images=rendered.folder))
+    map_ = import_colmap(project.model, options=ImportOptions(images=rendered.folder))
     cosines = []
-    for name, seen in posed.build.map.observations.items():
-        one, two = (unit_rows(m.features[name].descriptors[seen.rows]) for m in (map_, posed.build.map))
+    for name, seen in posed.map.observations.items():
+        one, two = (unit_rows(m.features[name].descriptors[seen.rows]) for m in (map_, posed.map))
         cosines.append((one * two).sum(axis=1))
     assert np.mean(np.concatenate(cosines) > 0.9) > 0.8
-    true = poses_of_queries(posed.build.map)
+    true = poses_of_queries(posed.map)
     assert poses_of_queries(map_) == pytest.approx(true, abs=0.02)
 
 
@@ -231,15 +231,15 @@ def test_images_that_are_missing_or_of_another_size_are_named(project, rendered,
     with pytest.raises(
         ImageError, match=r"frame 2\.png: 320x200 pixels, but its camera in the model has 320x240"
     ):
-        import_colmap(project.model, ImportOptions(images=folder))
+        import_colmap(project.model, options=ImportOptions(images=folder))
     path.write_text("hello")
     with pytest.raises(ImageError, match=r"frame 2\.png: not a readable image"):
-        import_colmap(project.model, ImportOptions(images=folder))
+        import_colmap(project.model, options=ImportOptions(images=folder))
     path.unlink()
     with pytest.raises(ImageError, match=r"frame 2\.png: no such image"):
-        import_colmap(project.model, ImportOptions(images=folder))
+        import_colmap(project.model, options=ImportOptions(images=folder))
     with pytest.raises(InputError, match="no such folder of images"):
-        import_colmap(project.model, ImportOptions(images=tmp_path / "missing"))
+        import_colmap(project.model, options=ImportOptions(images=tmp_path / "missing"))
 
 
 def test_images_of_something_else_are_a_model_error(project, rendered, tmp_path):
@@ -247,7 +247,7 @@ def test_images_of_something_else_are_a_model_error(project, rendered, tmp_path)
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.fromarray(np.full((240, 320, 3), 90, np.uint8)).save(tmp_path / name)
     with pytest.raises(ModelError, match=r"at only 0 of the .* keypoints"):
-        import_colmap(project.model, ImportOptions(images=tmp_path))
+        import_colmap(project.model, options=ImportOptions(images=tmp_path))
 
 
 def test_a_model_without_points_is_a_model_error(project, tmp_path):
@@ -256,30 +256,56 @@ def test_a_model_without_points_is_a_model_error(project, tmp_path):
         model.delete_point3D(i)
     model.write_binary(tmp_path)
     with pytest.raises(ModelError, match="no 3D points; triangulate it first"):
-        import_colmap(tmp_path, ImportOptions(database=project.folder / "database.db"))
+        import_colmap(tmp_path, options=ImportOptions(database=project.folder / "database.db"))
 
 
-def test_a_given_box_is_taken(project, rendered, tmp_path):
+def test_a_given_box_is_used(project, rendered, tmp_path):
     np.savetxt(tmp_path / "box3d_corners.txt", rendered.known.box.corners)
-    map_ = import_colmap(project.model, ImportOptions(box=tmp_path / "box3d_corners.txt"))
+    map_ = import_colmap(project.model, options=ImportOptions(box=tmp_path / "box3d_corners.txt"))
     assert map_.info.box_source == "given"
     assert map_.box.diagonal == pytest.approx(rendered.known.box.diagonal)
 
 
-def test_one_source_of_descriptors_is_enough():
+def test_two_sources_of_descriptors_are_refused():
     path = Path("x")
-    with pytest.raises(ValueError, match="database and images: give just one"):
+    with pytest.raises(ValueError, match="database and images: give only one"):
         ImportOptions(database=path, images=path)
     with pytest.raises(ValueError, match="matches needs features"):
         ImportOptions(matches=path)
 
 
-def test_a_database_tells_scales_and_orientations_as_colmap_reads_them():
+def replace_keypoints(path, map_, columns):
+    """Give the keypoints of a database more columns, the same for every image."""
+    with pycolmap.Database.open(path) as database:
+        for name, image in map_.images.items():
+            keypoints = map_.features[name].keypoints
+            rows = np.resize(columns, (len(keypoints), columns.shape[1])).astype(np.float32)
+            database.update_keypoints(image.image_id, np.hstack([keypoints, rows]))
+
+
+@pytest.mark.parametrize("form", ["affine shapes", "scales and orientations", "positions"])
+def test_scales_and_orientations_of_a_database_are_read_as_colmap_reads_them(editable, posed, form):
     read = pycolmap.FeatureKeypoint.from_shape_parameters
     made = [read(10.0 + i, 20.0, 1.5 + i, 2.0 + i, 0.4 * i, 0.1) for i in range(5)]
-    values = np.array([(k.x, k.y, k.a11, k.a12, k.a21, k.a22) for k in made], np.float32)
     expected = np.array([(k.compute_scale(), k.compute_orientation()) for k in made])
-    assert np.allclose(_frames(values), expected, atol=1e-5)
-    short = np.array([(k.x, k.y, *frame) for k, frame in zip(made, expected, strict=True)], np.float32)
-    assert np.allclose(_frames(short), expected, atol=1e-5)
-    assert _frames(values[:, :2]) is None
+    columns = {
+        "affine shapes": np.array([(k.a11, k.a12, k.a21, k.a22) for k in made]),
+        "scales and orientations": expected,
+        "positions": np.zeros((5, 0)),
+    }[form]
+    replace_keypoints(editable.folder / "database.db", posed.map, columns)
+    map_ = import_colmap(editable.model)
+    for name in posed.map.images:
+        frames = map_.features[name].frames
+        if form == "positions":
+            assert frames is None
+        else:
+            assert np.allclose(frames, np.resize(expected, frames.shape), atol=1e-5)
+
+
+def test_images_can_be_named_directly(project, rendered):
+    map_ = import_colmap(str(project.model), images=str(rendered.folder))
+    by_options = import_colmap(project.model, options=ImportOptions(images=rendered.folder))
+    assert map_.fingerprint == by_options.fingerprint
+    with pytest.raises(ValueError, match="database and images: give only one"):
+        import_colmap(project.model, rendered.folder, ImportOptions(database=project.folder / "database.db"))

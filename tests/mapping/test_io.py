@@ -58,8 +58,8 @@ def test_a_map_is_read_as_it_was_written(exact, written):
 
 
 def test_a_built_map_is_read_as_it_was_written(unposed, tmp_path):
-    write_map(unposed.build.map, tmp_path / "map")
-    assert_equal(unposed.build.map, read_map(tmp_path / "map"))
+    write_map(unposed.map, tmp_path / "map")
+    assert_equal(unposed.map, read_map(tmp_path / "map"))
 
 
 def test_equal_maps_are_equal_files(exact, written, tmp_path):
@@ -77,7 +77,7 @@ def test_a_map_may_overwrite_the_one_it_is_read_from(written):
     assert files(written) == before
 
 
-def test_a_map_without_matches_has_no_file_of_them(exact, tmp_path):
+def test_a_map_without_matches_has_no_match_file(exact, tmp_path):
     write_map(replace(exact, matches={}), tmp_path / "map")
     assert not (tmp_path / "map" / "matches.h5").exists()
     assert read_map(tmp_path / "map").matches == {}
@@ -90,7 +90,7 @@ def test_the_model_opens_in_pycolmap(written, exact):
     assert model.compute_mean_reprojection_error() == pytest.approx(0, abs=1e-9)
 
 
-def test_observations_project_where_they_are_seen(exact):
+def test_points_project_to_their_observations(exact):
     for name, seen in exact.observations.items():
         image = exact.images[name]
         points = image.cam_from_world() * exact.points3D_in_world[seen.points]
@@ -111,7 +111,7 @@ def change_info(path, change):
     (path / "map.json").write_text(json.dumps(data))
 
 
-def test_a_map_of_a_later_format_is_refused_with_what_to_do(written):
+def test_a_map_of_a_later_format_asks_to_upgrade(written):
     change_info(written, lambda data: data.update(format_version=FORMAT_VERSION + 1))
     with pytest.raises(MapError, match=f"format {FORMAT_VERSION + 1}.*upgrade slimsfm"):
         read_map(written)
@@ -121,7 +121,7 @@ def test_a_map_of_a_later_format_is_refused_with_what_to_do(written):
 @pytest.mark.parametrize("how", ["missing", "null", "word"])
 def test_damaged_info_is_a_map_error(written, key, how):
     if key in ("unit", "origin") and how == "word":
-        pytest.skip("a word is just what belongs there")
+        pytest.skip("a word is valid here")
     change_info(
         written, lambda d: d.pop(key) if how == "missing" else d.update({key: {"word": "x"}.get(how)})
     )
@@ -130,7 +130,7 @@ def test_damaged_info_is_a_map_error(written, key, how):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", '"map"', "\xff"], ids=repr)
-def test_a_file_that_is_no_info_is_a_map_error(written, text):
+def test_invalid_json_is_a_map_error(written, text):
     (written / "map.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(MapError, match=r"map\.json: damaged"):
         read_map(written)
@@ -152,7 +152,7 @@ def test_a_part_cut_short_is_a_map_error(written, part):
         read_map(written)
 
 
-def test_what_is_no_map_is_a_map_error(tmp_path):
+def test_a_path_that_is_not_a_map_is_a_map_error(tmp_path):
     (tmp_path / "file").write_text("hello")
     for path in (tmp_path, tmp_path / "missing", tmp_path / "file"):
         with pytest.raises(MapError, match=r"not a map \(it has no map.json\)"):
@@ -166,7 +166,7 @@ def test_an_image_without_features_is_named(written):
         read_map(written)
 
 
-def test_features_of_another_number_than_keypoints_are_a_map_error(written, exact, tmp_path):
+def test_more_or_fewer_features_than_keypoints_are_a_map_error(written, exact, tmp_path):
     with h5py.File(written / "features.h5", "r+") as file:
         for part, shape in (("keypoints", (10, 2)), ("descriptors", (32, 10)), ("scores", 10)):
             del file["003.png"][part]

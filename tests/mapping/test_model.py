@@ -28,7 +28,7 @@ MODELS = {"single": small_model, "rig": rig_model}
 
 
 def contents(model):
-    """Everything that a model holds, comparable."""
+    """All content of a model, for comparison."""
     return {
         "cameras": {i: (c.model_name, c.width, c.height, *c.params) for i, c in model.cameras.items()},
         "rigs": {i: sorted(str(s) for s in r.sensor_ids()) for i, r in model.rigs.items()},
@@ -50,7 +50,7 @@ def contents(model):
 
 @pytest.fixture
 def text(tmp_path):
-    """A small model as text, ready to be damaged."""
+    """A small model as text, to be damaged."""
     small_model().write_text(tmp_path)
     return tmp_path
 
@@ -91,7 +91,7 @@ def test_models_from_before_rigs_and_frames_are_read(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["binary", "text"])
-def test_names_may_hold_spaces_and_folders(tmp_path, kind):
+def test_names_may_contain_spaces_and_folders(tmp_path, kind):
     model = small_model()
     names = {1: "take 1/frame  1.png", 2: "take 1/frame 2.png", 3: "ä ö.png"}
     for image_id, name in names.items():
@@ -116,7 +116,7 @@ def test_a_binary_file_of_any_wrong_length_is_a_model_error(tmp_path, make, part
 
 
 def outcome(folder):
-    """Reads a model in a child process, which may crash without harm, and walks through all of it."""
+    """Read a model and all of its content in a child process, which may crash."""
     child = os.fork()
     if child == 0:
         code = 2
@@ -209,7 +209,7 @@ WRONG_WORDS = {
 
 
 @pytest.mark.parametrize("wrong", WRONG_WORDS.values(), ids=WRONG_WORDS.keys())
-def test_a_model_whose_parts_do_not_fit_is_a_model_error(text, wrong):
+def test_a_model_of_inconsistent_parts_is_a_model_error(text, wrong):
     replace_word(text, *wrong)
     with pytest.raises(ModelError, match=str(text)):
         read_model(text)
@@ -220,7 +220,7 @@ def test_a_track_without_an_observation_that_its_image_has_is_a_model_error(text
     row = first_record(lines)
     lines[row] = " ".join(lines[row].split(" ")[:-2])
     (text / "points3D.txt").write_text("\n".join(lines))
-    with pytest.raises(ModelError, match="refer to each other"):
+    with pytest.raises(ModelError, match="do not belong together"):
         read_model(text)
 
 

@@ -25,14 +25,14 @@ def assert_pairs(pairs, names):
 
 
 @given(names=NAMES)
-def test_exhaustive_pairs_are_all_there_are(names):
+def test_exhaustive_pairs_are_all_pairs(names):
     pairs = exhaustive_pairs(names)
     assert_pairs(pairs, names)
     assert len(pairs) == len(names) * (len(names) - 1) // 2
 
 
 @given(names=NAMES, overlap=st.integers(1, 4))
-def test_sequential_pairs_join_all_images_to_one_chain(names, overlap):
+def test_sequential_pairs_connect_all_images(names, overlap):
     pairs = sequential_pairs(names, overlap=overlap)
     assert_pairs(pairs, names)
     assert len(pairs) >= len(names) - 1
@@ -48,7 +48,7 @@ def test_sequential_pairs_follow_the_numbers_in_the_names():
     assert pairs == {(i, i + k) for k in (1, 2, 4, 6) for i in range(30 - k)}
 
 
-def test_names_with_digits_that_are_no_decimals_are_ordered():
+def test_names_with_digits_that_are_not_decimals_are_ordered():
     assert sequential_pairs(["1²2.png", "1b.png", "x.png"])
 
 
@@ -87,7 +87,7 @@ def test_lookalikes_are_found_by_their_features():
 
 @pytest.mark.parametrize("choice", ["similar", "exhaustive", "sequential", "auto"])
 @pytest.mark.parametrize("counts", [(0, 3, 5), (1, 1, 1), (0, 0, 0)])
-def test_images_of_few_features_are_paired_too(choice, counts):
+def test_images_with_few_features_are_paired(choice, counts):
     rng = np.random.default_rng(0)
     features = {
         f"{i}.png": features_of(rng.integers(0, 255, (count, 16)).astype(np.uint8))

@@ -10,7 +10,7 @@ from scenes import exact_map, with_matches
 from slimsfm.errors import InputError
 from slimsfm.features import Features
 from slimsfm.mapping.io import read_map, write_map
-from slimsfm.mapping.subset import Selection, keep_images
+from slimsfm.mapping.subset import FilteredMapping, keep_images
 
 PARTIAL = with_matches(exact_map(8, 60, reach_deg=80))
 NAMES = list(PARTIAL.images)
@@ -18,7 +18,7 @@ SUBSETS = st.sets(st.sampled_from(NAMES), min_size=1)
 
 
 def parents(map_):
-    """The images that see each point, from its track."""
+    """The images that observe each point, from its track."""
     names = {image.image_id: name for name, image in map_.images.items()}
     return {
         i: [(names[e.image_id], e.point2D_idx) for e in map_.model.point3D(i).track.elements]
@@ -27,14 +27,14 @@ def parents(map_):
 
 
 @given(names=SUBSETS, min_track_length=st.integers(1, 3))
-def test_the_points_kept_are_those_with_kept_parents(names, min_track_length):
+def test_points_with_enough_kept_observations_stay(names, min_track_length):
     kept = keep_images(PARTIAL, names, min_track_length=min_track_length)
     restricted = {i: [e for e in track if e[0] in names] for i, track in parents(PARTIAL).items()}
     assert parents(kept) == {i: track for i, track in restricted.items() if len(track) >= min_track_length}
 
 
 @given(names=SUBSETS)
-def test_what_is_kept_stays_as_it_was(names):
+def test_kept_images_and_points_do_not_change(names):
     kept = keep_images(PARTIAL, names)
     assert list(kept.images) == sorted(names)
     assert kept.model.is_valid()
@@ -65,14 +65,14 @@ def test_keeping_all_images_changes_nothing_on_disk(tmp_path):
         assert (tmp_path / "before" / part).read_bytes() == (tmp_path / "after" / part).read_bytes()
 
 
-def test_the_order_and_number_of_mentions_do_not_count(tmp_path):
+def test_the_order_and_duplicates_of_names_do_not_matter(tmp_path):
     write_map(keep_images(PARTIAL, NAMES[:3]), tmp_path / "a")
     write_map(keep_images(PARTIAL, [NAMES[2], NAMES[0], NAMES[2], NAMES[1]]), tmp_path / "b")
     for path in (tmp_path / "a").rglob("*.bin"):
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
 
 
-def test_keeping_in_two_steps_is_keeping_at_once():
+def test_keeping_in_two_steps_equals_keeping_at_once():
     twice = keep_images(keep_images(PARTIAL, NAMES[:5]), NAMES[2:4])
     assert parents(twice) == parents(keep_images(PARTIAL, NAMES[2:4]))
 
@@ -85,10 +85,10 @@ def test_the_map_itself_is_not_changed(tmp_path):
         assert path.read_bytes() == (tmp_path / "after" / path.relative_to(tmp_path / "before")).read_bytes()
 
 
-def test_unknown_names_and_no_name_are_input_errors():
+def test_unknown_names_and_an_empty_list_are_input_errors():
     with pytest.raises(InputError, match=r"'missing\.png' is not in the map"):
         keep_images(PARTIAL, [NAMES[0], "missing.png"])
-    with pytest.raises(InputError, match="no image was chosen"):
+    with pytest.raises(InputError, match="no image to keep was given"):
         keep_images(PARTIAL, [])
 
 
@@ -128,14 +128,14 @@ def test_one_image_of_a_frame_of_a_rig_can_be_kept(tmp_path):
         assert len(read.point3D_ids) == 30
 
 
-def test_a_selection_reads_only_what_is_asked_for():
+def test_a_filtered_mapping_reads_only_requested_values():
     class Source(dict):
         def __getitem__(self, key):
             asked.append(key)
             return super().__getitem__(key)
 
     asked: list[str] = []
-    chosen = Selection(Source(a=1, b=2, c=3), {"a", "c"}.__contains__)
+    chosen = FilteredMapping(Source(a=1, b=2, c=3), {"a", "c"}.__contains__)
     assert list(chosen) == ["a", "c"]
     assert len(chosen) == 2
     assert "b" not in chosen

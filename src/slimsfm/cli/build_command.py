@@ -1,8 +1,6 @@
 """`slimsfm build`."""
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 from slimsfm.cli.networks import Networks
@@ -41,14 +39,13 @@ def build_photos(
     watch = Stopwatch()
     networks.apply()
     check_output(output, images, overwrite=overwrite)
-    with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
-        made = build_map(images, Path(workspace), build, progress=shown)
-        write_map(made.map, output, overwrite=overwrite)
-    if made.left_out:
-        console.print(f"left out, for they fit the model nowhere: {', '.join(made.left_out)}", style="yellow")
-    box = made.map.box
-    console.print(f"box {made.map.info.box_source}, diagonal {box.diagonal:.3g} ({made.map.info.unit} unit)")
-    finish_map(made.map, output, watch)
+    made = build_map(images, build, progress=shown)
+    write_map(made, output, overwrite=overwrite)
+    if made.unregistered:
+        names = ", ".join(made.unregistered)
+        console.print(f"{len(made.unregistered)} photos could not be registered: {names}", style="yellow")
+    console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} ({made.info.unit} unit)")
+    finish_map(made, output, watch)
 
 
 def main(arguments: Sequence[str]) -> None:

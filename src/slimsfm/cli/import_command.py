@@ -35,7 +35,7 @@ def import_(
     """
     watch = Stopwatch()
     check_output(output, model, overwrite=overwrite)
-    made = import_colmap(model, source, progress=shown)
+    made = import_colmap(model, options=source, progress=shown)
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")
     finish_map(made, output, watch)

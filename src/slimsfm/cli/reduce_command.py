@@ -14,9 +14,9 @@ from slimsfm.cli.limits import Limits
 from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
 from slimsfm.errors import InputError
 from slimsfm.features.methods import DETECTOR_FREE
-from slimsfm.mapping.direct import with_points
 from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map, check_has_features
+from slimsfm.mapping.subset import with_points
 from slimsfm.progress import shown
 from slimsfm.reduction import Candidate, FrontierOptions, Maker, frontier, recommend, try_images
 from slimsfm.selection import SELECTORS

@@ -139,7 +139,8 @@ def map_object(
         box=sequences.box,
         unit=sequences.unit,
     )
-    return build_map(sequences.mapping.folder, workspace, options, known, progress).map
+    folder = sequences.mapping.folder
+    return build_map(folder, options, known=known, workspace=workspace, progress=progress)
 
 
 def hold_out(truth: Map, queries: list[str]) -> Map:

@@ -10,7 +10,6 @@ observe. The result is a map without any trace of the queries.
 """
 
 import logging
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,7 +107,7 @@ class Colmap:
     def load(self, name: str, options: LoadOptions) -> ObjectSequences:
         """Import the model and split off the queries."""
         check_object_name(name, self.names(), self.path)
-        truth = import_colmap(self.path, self._import_options(), options.progress)
+        truth = import_colmap(self.path, options=self._import_options(), progress=options.progress)
         for one in truth.images:
             self._check_image(truth, one)
         listed = self.queries
@@ -214,9 +213,7 @@ def _pseudo_ground_truth(folder: Path, options: LoadOptions) -> Map:
     """
     names, path = set(list_images(folder)), options.folder / "pseudo-ground-truth"
     if not path.exists():
-        with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
-            made = build_map(folder, Path(workspace), options.build, progress=options.progress)
-            write_map(made.map, path)
+        write_map(build_map(folder, options.build, progress=options.progress), path)
     truth = read_map(path)
     if unknown := truth.images.keys() - names:
         raise InputError(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pycolmap
 
-from slimsfm.execution import num_cores, map_on_threads
+from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
 from slimsfm.localization.multi import MultiLocalizer

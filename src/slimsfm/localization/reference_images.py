@@ -16,7 +16,7 @@ from slimsfm.arrays import Descriptors
 from slimsfm.features.vlad import vlad
 from slimsfm.localization.matching import ReferenceMatching, matching_with
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target, unite
-from slimsfm.mapping.global_descriptors import describe_images
+from slimsfm.mapping.descriptors import describe_images
 from slimsfm.mapping.map import Map, check_has_features, observed
 
 _STRONGEST = 2048  # keypoints that the global descriptor of a query is computed from

@@ -1,13 +1,12 @@
-"""Maps: what they are, how they are read, written, built, imported and cut down to some images."""
+"""Maps: build, import, read and write them, and keep some of their images."""
 
-from slimsfm.mapping.build import Build, BuildOptions, KnownPoses, build_map
+from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map, MapInfo, Observations
 from slimsfm.mapping.subset import keep_images
 
 __all__ = [
-    "Build",
     "BuildOptions",
     "ImportOptions",
     "KnownPoses",

@@ -1,4 +1,4 @@
-"""The object's box: read from a file, or estimated from the points that the images look at."""
+"""Read the object's box from a file, or estimate it from the points that the images look at."""
 
 import json
 from pathlib import Path
@@ -11,18 +11,19 @@ from slimsfm.arrays import Ids, Points3D
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
 
-_ROUNDS = 50  # of trimming; it settles in fewer
+_ROUNDS = 50  # of trimming; it converges in fewer
 _REACH = 2.0  # points beyond this many times the root mean square distance are background
 _SPREAD = 0.25  # of the Gaussian, over the shorter side of the image
-_TAIL = 0.01  # share of the weight left out at either end of the box
+_TAIL = 0.01  # share of the weight outside either end of the box
 
 
-def read_box(path: Path) -> Box:
+def read_box(path: str | Path) -> Box:
     """Read a box from JSON (`{"corners": [[x, y, z], ...]}` or the list alone) or `box3d_corners.txt`.
 
     Raises:
         InputError: The file is missing, or does not hold the 8 corners of a box.
     """
+    path = Path(path)
     try:
         if path.suffix.lower() == ".json":
             data = json.loads(path.read_text())
@@ -35,18 +36,19 @@ def read_box(path: Path) -> Box:
         raise InputError(f"{path}: no such box file") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path}: should hold the 8 corners of a box, a line or list of x y z each ({error})"
+            f"{path}: must hold the 8 corners of a box, each a line or list of x y z ({error})"
         ) from error
 
 
 def estimate_box(model: pycolmap.Reconstruction) -> Box:
-    """Estimate the box of what the images look at.
+    """Estimate the box of the object that the images look at.
 
-    A point counts by how often, and how near the middle of an image, it is seen. What is farther from the
-    mean than twice the root mean square distance is background and trimmed, until nothing changes. The box is
-    aligned with the principal axes of what remains and holds all but 1 % of the count at each of its sides.
+    The weight of a point grows with the number of its observations and with how close they are to the image
+    centers. Points farther from the weighted mean than twice the root mean square distance are background;
+    they are removed until nothing changes. The box is aligned with the principal axes of the remaining points
+    and leaves out 1 % of their weight at each of its sides.
 
-    Where masks were used, features and so points lie on the object alone, and the same rule holds.
+    With masks, all features and points lie on the object, and the same rule works.
     """
     ids = sorted(model.point3D_ids())
     points = np.array([model.point3D(i).xyz for i in ids], np.float64).reshape(-1, 3)
@@ -63,7 +65,7 @@ def estimate_box(model: pycolmap.Reconstruction) -> Box:
 
 
 def _centrality(model: pycolmap.Reconstruction, ids: Ids) -> Float64[np.ndarray, " n"]:
-    """For each point the sum over its observations of a Gaussian of their distance to the image's centre."""
+    """Weight per point: a Gaussian of the distance to the image center, summed over its observations."""
     weights = np.zeros(len(ids))
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)

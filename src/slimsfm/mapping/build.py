@@ -1,6 +1,8 @@
-"""Photos to map."""
+"""Build maps from photos by Structure from Motion."""
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -15,16 +17,15 @@ from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.build_keypoint_free import PhotoFolder, build_without_keypoints
-from slimsfm.mapping.cameras import CameraSharing, guess_cameras
 from slimsfm.mapping.cell_keypoints import Matches
-from slimsfm.mapping.extraction import color_points, extract_features
-from slimsfm.mapping.global_descriptors import with_global_descriptors
+from slimsfm.mapping.descriptors import with_global_descriptors
+from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.image_pairs import choose_image_pairs
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.pair_matching import match_pairs_with, verify_pairs
-from slimsfm.mapping.pairs import PairChoice, choose_pairs
+from slimsfm.mapping.pairs import PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.photo_file import shrink_photo
 from slimsfm.mapping.sfm import (
+    colmap_warnings,
     match_pairs,
     put_keypoints,
     reconstruct,
@@ -42,31 +43,32 @@ class BuildOptions:
     """How a map is built from photos."""
 
     camera: CameraSharing = "auto"
-    """Which images share a camera: all, none, or (auto) those of equal size and EXIF focal length."""
+    """Images that share a camera: all (shared), none (per-image), or images of equal size and EXIF focal
+    length (auto)."""
 
     pairs: PairChoice = "auto"
-    """Images to match: each with every other one, with its neighbours in order of name, or with those that
-    look alike. Auto: exhaustive up to 200 images, above that sequential and similar; without a detector
-    exhaustive up to 30, above that by pose where poses are known, else sequential."""
+    """Pairs of images to match: all (exhaustive), neighbors in order of name (sequential), or images that
+    look alike (similar). auto: exhaustive up to 200 images, otherwise sequential and similar; without a
+    detector, exhaustive up to 30 images, otherwise by pose if poses are known, else sequential."""
 
     masks: Path | None = None
-    """Folder of masks, NAME.png for image NAME (COLMAP's convention): no features where they are black."""
+    """Folder of masks, NAME.png for image NAME as in COLMAP; features on black pixels are ignored."""
 
     extractor: str = "sift"
-    """Local features, see `slimsfm methods`; loftr finds none and matches images as wholes."""
+    """Local features, see `slimsfm methods`; loftr matches images without a detector."""
 
     matcher: str = "nearest"
-    """What matches features: nearest, lightglue or superglue."""
+    """Matcher of the features: nearest, lightglue or superglue."""
 
     max_image_size: int | None = None
-    """Shrink larger images for extraction so that their longer side has this many pixels; else as the
-    extractor does by itself: SIFT to 1600, learned ones to 1024, loftr to 640."""
+    """Longer side in pixels to which larger images are shrunk before extraction. Default: 1600 for SIFT, 1024
+    for learned features, 640 for loftr."""
 
     max_features: int | None = None
-    """Most features of one image; else what the extractor does by itself: SIFT 4096, learned ones 2048."""
+    """Largest number of features per image. Default: 4096 for SIFT, 2048 for learned features."""
 
     box: Path | None = None
-    """The object's box: JSON or OnePose's box3d_corners.txt. Without it the box is estimated."""
+    """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
 
     seed: int = 0
     """Seed of every random choice."""
@@ -78,62 +80,56 @@ class BuildOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownPoses:
-    """Cameras and poses known beforehand, by image name, with the box in their world; none is refined."""
+    """Known cameras and poses of images; none of them is refined."""
 
     cameras: Mapping[str, pycolmap.Camera]
-    """Intrinsics; images with equal `camera_id` share a camera."""
+    """Intrinsics by image name; images with equal `camera_id` share a camera."""
 
     cam_from_world: Mapping[str, pycolmap.Rigid3d]
-    """Poses."""
+    """Poses by image name."""
 
     box: Box
-    """The object's box."""
+    """The object's box in the world frame."""
 
     unit: str
-    """Unit of the world."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Build:
-    """A map and what did not get into it."""
-
-    map: Map
-    """The map."""
-
-    left_out: tuple[str, ...]
-    """Names of images without a place in the model."""
+    """Unit of the world frame, such as "metre"."""
 
 
 def build_map(
-    images: Path,
-    workspace: Path,
+    images: str | Path,
     options: BuildOptions = BuildOptions(),
+    *,
     known: KnownPoses | None = None,
+    workspace: str | Path | None = None,
     progress: ProgressBar = silent,
-) -> Build:
+) -> Map:
     """Build a map from a folder of photos by Structure from Motion.
 
+    Photos that could not be registered are named in `Map.unregistered`. The map reads its features from disk
+    when they are needed, so that large maps fit into memory.
+
     Args:
-        images: Folder; every image below it is used, or, with known poses, those that have one.
-        workspace: Folder for intermediate files; the map reads its features from there.
+        images: Folder. All images in it and its subfolders are used or, with known poses, those with a pose.
         options: How to build.
-        known: Poses known beforehand: then points are triangulated and nothing else is estimated.
-        progress: Told of the long loops.
+        known: Known poses: points are triangulated and nothing else is estimated.
+        workspace: Folder that keeps the intermediate files: COLMAP's database, model and the features. By
+            default a temporary folder that is removed.
+        progress: Progress callback.
 
     Raises:
         InputError: The folder, an image, a mask or the box cannot be used.
         ReconstructionError: The images give no model.
     """
+    images = Path(images)
     names = sorted(known.cam_from_world) if known else list_images(images)
     if len(names) < 2:
         raise InputError(f"{images}: holds {len(names)} image; a map needs at least two")
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
-    workspace.mkdir(parents=True, exist_ok=True)
     cameras = known.cameras if known else guess_cameras(images, names, options.camera)
-    work = _Work(images, names, workspace, cameras, known, progress)
     make_parts = _parts_without_keypoints if extractor.name in DETECTOR_FREE else _parts_with_keypoints
-    parts = make_parts(work, extractor, options)
+    with _opened(workspace) as folder, colmap_warnings():
+        parts = make_parts(_Work(images, names, folder, cameras, known, progress), extractor, options)
     info = MapInfo(
         extractor=extractor.name,
         extractor_options=extractor.options,
@@ -142,19 +138,32 @@ def build_map(
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
     )
+    registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     made = Map(
-        model=parts.model, features=parts.features, matches=parts.matches, photos=parts.photos, info=info
+        model=parts.model,
+        features=parts.features,
+        matches=parts.matches,
+        photos=parts.photos,
+        info=info,
+        unregistered=tuple(name for name in names if name not in registered),
     )
-    return _build(with_global_descriptors(made), names)
+    return with_global_descriptors(made)
 
 
-def _build(map: Map, names: list[str]) -> Build:
-    return Build(map=map, left_out=tuple(name for name in names if name not in map.images))
+@contextmanager
+def _opened(workspace: str | Path | None) -> Iterator[Path]:
+    """The workspace, or a temporary one. The open file of features stays readable after it is removed."""
+    if workspace is None:
+        with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as folder:
+            yield Path(folder)
+    else:
+        Path(workspace).mkdir(parents=True, exist_ok=True)
+        yield Path(workspace)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Parts:
-    """What images become."""
+    """The parts of a map that come from its images."""
 
     model: pycolmap.Reconstruction
     features: Mapping[str, Features]
@@ -163,7 +172,7 @@ class _Parts:
 
 
 class _Work(NamedTuple):
-    """What both ways of building need."""
+    """Input of both ways of building, with and without keypoints."""
 
     images: Path
     names: list[str]
@@ -176,12 +185,13 @@ class _Work(NamedTuple):
 def _parts_with_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
     output, names = work.workspace / "features.h5", work.names
     features, colors = extract_features(work.images, names, extractor, options.masks, output, work.progress)
-    database = _match(work, features, options)
+    database, sfm = _match(work, features, options), work.workspace / "sfm"
+    seed, progress = options.seed, work.progress
     if work.known:
         poses = work.known.cam_from_world
-        model = triangulate(database, names, work.workspace / "sfm", poses, seed=options.seed)
+        model = triangulate(database, names, sfm, poses, seed=seed, progress=progress)
     else:
-        model = reconstruct(database, names, work.workspace / "sfm", seed=options.seed)
+        model = reconstruct(database, names, sfm, seed=seed, progress=progress)
     put_keypoints(model, features)
     color_points(model, colors)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
@@ -208,11 +218,11 @@ def _parts_without_keypoints(work: _Work, extractor: Extractor, options: BuildOp
 
 
 def _extractor(options: BuildOptions) -> Extractor:
-    wishes: dict = {"max_features": options.max_features, "max_image_size": options.max_image_size}
+    wanted: dict = {"max_features": options.max_features, "max_image_size": options.max_image_size}
     if options.extractor in DETECTOR_FREE and find_weights("loftr-onepose++"):
-        wishes["weights"] = "loftr-onepose++"  # the map then serves OnePose++ as well
+        wanted["weights"] = "loftr-onepose++"  # the map then serves OnePose++ as well
     return load_extractor(
-        options.extractor, {key: value for key, value in wishes.items() if value is not None}
+        options.extractor, {key: value for key, value in wanted.items() if value is not None}
     )
 
 
@@ -225,5 +235,5 @@ def _match(work: _Work, features: FeatureFile, options: BuildOptions) -> Path:
     else:
         matcher = load_matcher(options.matcher, options.extractor)
         matches = match_pairs_with(matcher, features, pairs, work.progress)
-        verify_pairs(database, names, matches, seed=options.seed)
+        verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
     return database

@@ -14,8 +14,7 @@ from slimsfm.features.image_matching import ImageMatcher, Photo
 from slimsfm.mapping.cell_keypoints import CellKeypoints, Matches, match_without_keypoints
 from slimsfm.mapping.extraction import color_points, mask_of
 from slimsfm.mapping.keypoint_free import refine_model
-from slimsfm.mapping.pair_matching import verify_pairs
-from slimsfm.mapping.pairs import Pairs
+from slimsfm.mapping.pairs import Pairs, verify_pairs
 from slimsfm.mapping.sfm import reconstruct, triangulate, verified_matches, write_database
 from slimsfm.photos import read_image
 from slimsfm.progress import ProgressBar, silent

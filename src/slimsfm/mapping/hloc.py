@@ -1,15 +1,15 @@
-"""A map as hloc reads it.
+"""Export maps to hloc.
 
 OUT/
   sfm/                COLMAP model; keypoint i of an image in it is row i of its features
   features.h5         the images' features
-  matches.h5          verified matches of pairs of images; where the map has any
-  references.txt      names of the images, one a line
-  pairs-queries.txt   `query reference`, one pair a line; where queries are named
+  matches.h5          verified matches of pairs of images; if the map has any
+  references.txt      names of the images, one per line
+  pairs-queries.txt   `query reference`, one pair per line; if queries are given
 
-hloc multiplies descriptors as they are stored, so bytes become half floats of unit length, and it measures
-orientations in degrees. Keypoints stay single floats: hloc's half ones are off by up to a quarter of a pixel
-beyond column 512, and by a half beyond 1024.
+hloc multiplies descriptors as they are stored, so bytes become half floats of unit length. It measures
+orientations in degrees. Keypoints stay single floats: hloc's half floats are off by up to a quarter of a
+pixel beyond column 512, and by half a pixel beyond column 1024.
 """
 
 from collections.abc import Iterable
@@ -23,31 +23,31 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features import Features, unit_rows
 from slimsfm.features.store import FeatureWriter, write_matches
 from slimsfm.files import replacing
-from slimsfm.mapping.map import Map, check_count
+from slimsfm.mapping.map import Map, check_num_features
 from slimsfm.photos import list_images
 
 
-def write_hloc(map: Map, path: Path, queries: Iterable[str] = (), *, overwrite: bool = False) -> None:
-    """Write a folder that hloc's `match_features` and `localize_sfm` run on.
+def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overwrite: bool = False) -> None:
+    """Write a folder for hloc's `match_features` and `localize_sfm`.
 
     Args:
-        map: A map whose images have features.
-        path: The folder.
-        queries: Names of queries: each is paired with every image of the map.
-        overwrite: Replace what is there.
+        map: A map with image features.
+        path: The folder to write.
+        queries: Names of queries; each is paired with every image of the map.
+        overwrite: Replace an existing folder.
 
     Raises:
-        MapError: The map is for direct matching alone.
-        InputError: A query is called as an image of the map is, or a name in a pair holds a space.
-        OutputError: The place is taken and `overwrite` is off, or cannot be written.
+        MapError: The map is for direct matching only.
+        InputError: A query has the name of an image of the map, or a name in a pair contains a space.
+        OutputError: The folder exists and `overwrite` is off, or it cannot be written.
     """
     if map.is_for_direct_matching:
         raise MapError(
             "the map is for direct matching alone, and hloc matches images; "
-            "reduce the full map by `slimsfm reduce MAP -o SMALL --for images`"
+            "export the full map, or one that is reduced for matching images"
         )
     pairs = _pairs(queries, map)
-    with replacing(path, overwrite=overwrite) as partial:
+    with replacing(Path(path), overwrite=overwrite) as partial:
         (partial / "sfm").mkdir(parents=True)
         map.model.write(partial / "sfm")
         _write_features(map, partial / "features.h5")
@@ -59,15 +59,16 @@ def write_hloc(map: Map, path: Path, queries: Iterable[str] = (), *, overwrite: 
             _write_lines(partial / "pairs-queries.txt", (f"{query} {name}" for query, name in pairs))
 
 
-def read_query_names(path: Path) -> list[str]:
-    """Read the names of queries: a folder of images, or a text file with a line for each.
+def read_query_names(path: str | Path) -> list[str]:
+    """Read the names of queries from a folder of images or a text file.
 
     Args:
-        path: In a file, a line is a name, or `NAME MODEL WIDTH HEIGHT PARAMS...` as hloc's lists have it.
+        path: A folder, or a file with a name or hloc's `NAME MODEL WIDTH HEIGHT PARAMS...` per line.
 
     Raises:
-        InputError: It is missing or holds no name, or a line is neither.
+        InputError: The file is missing or holds no name, or a line has another format.
     """
+    path = Path(path)
     if path.is_dir():
         return list_images(path)
     try:
@@ -76,7 +77,7 @@ def read_query_names(path: Path) -> list[str]:
         raise InputError(f"{path}: neither a folder of images nor a readable list of names") from error
     names = [_name(line, path) for line in lines if line.strip() and not line.startswith("#")]
     if not names:
-        raise InputError(f"{path}: names no query")
+        raise InputError(f"{path}: holds no name of a query")
     return list(dict.fromkeys(names))
 
 
@@ -94,12 +95,12 @@ def _pairs(queries: Iterable[str], map: Map) -> list[tuple[str, str]]:
     pairs = [(query, name) for query in queries for name in map.images]
     for name in dict.fromkeys(name for pair in pairs for name in pair):
         if len(name.split()) > 1:
-            raise InputError(f"{name!r}: hloc reads no pair of a name with a space; rename the image")
+            raise InputError(f"{name!r}: hloc cannot read pairs of names with spaces; rename the image")
     for query, _ in pairs:
         if query in map.images:
             raise InputError(
-                f"query {query!r} is called as an image of the map is, and hloc tells images by name alone; "
-                "list only the queries"
+                f"query {query!r} has the name of an image of the map, and hloc identifies images by name; "
+                "list only queries"
             )
     return pairs
 
@@ -108,7 +109,7 @@ def _write_features(map: Map, path: Path) -> None:
     with FeatureWriter(path) as writer:
         for name, image in map.images.items():
             features = map.features[name]
-            check_count(image, len(features))
+            check_num_features(image, len(features))
             writer.write(name, _as_in_hloc(features))
 
 

@@ -1,7 +1,7 @@
-"""An existing COLMAP model to map: the model stays as it is, its keypoints get their descriptors."""
+"""Import COLMAP models as maps: the model does not change, its keypoints get their descriptors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,50 +13,50 @@ from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
 from slimsfm.mapping.box import estimate_box, read_box
-from slimsfm.mapping.global_descriptors import with_global_descriptors
+from slimsfm.mapping.descriptors import with_global_descriptors
+from slimsfm.mapping.extraction import redescribe
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, read_model
-from slimsfm.mapping.redescribe import redescribe
-from slimsfm.mapping.sfm import verified_matches
+from slimsfm.mapping.sfm import colmap_warnings, verified_matches
 from slimsfm.progress import ProgressBar, silent
 
-_MIN_INLIERS = 15  # matches of a verified pair, as COLMAP has it
+_MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
 _MAX_EPIPOLAR_ERROR_PX = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
-    """Where the descriptors of a model's keypoints come from: exactly one of the first three."""
+    """Source of the descriptors of a model's keypoints: at most one of the first three."""
 
     database: Path | None = None
-    """The model's COLMAP database. If nothing is given, a database.db beside the model is looked for."""
+    """The model's COLMAP database. Without any source, database.db is searched for next to the model."""
 
     features: Path | None = None
     """hloc's features.h5."""
 
     images: Path | None = None
-    """Folder of the model's images: SIFT descriptors are computed at the model's keypoints."""
+    """Folder of the model's images, to compute SIFT descriptors at the model's keypoints."""
 
     matches: Path | None = None
-    """hloc's matches.h5, to go with `features`."""
+    """hloc's matches.h5; requires `features`."""
 
     extractor: str = "sift"
-    """Name of the extractor that made `features`; queries are extracted with it."""
+    """Extractor of `features`, which is also used for queries."""
 
     box: Path | None = None
-    """The object's box: JSON or OnePose's box3d_corners.txt. Without it the box is estimated."""
+    """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
 
     def __post_init__(self) -> None:
         given = [name for name in ("database", "features", "images") if getattr(self, name) is not None]
         if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)}: give just one source of descriptors")
+            raise ValueError(f"{' and '.join(given)}: give only one source of descriptors")
         if self.matches is not None and self.features is None:
-            raise ValueError("matches needs features, the keypoints that it speaks of")
+            raise ValueError("matches needs features, which hold the matched keypoints")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Source:
-    """Descriptors, and matches where there are any, from one of the possible sources."""
+    """Descriptors and, if the source has them, matches."""
 
     features: Mapping[str, Features]
     matches: Mapping[tuple[str, str], IndexPairs]
@@ -66,21 +66,36 @@ class _Source:
 
 
 def import_colmap(
-    model_path: Path, options: ImportOptions = ImportOptions(), progress: ProgressBar = silent
+    model_path: str | Path,
+    images: str | Path | None = None,
+    options: ImportOptions = ImportOptions(),
+    *,
+    progress: ProgressBar = silent,
 ) -> Map:
-    """Make a map of a COLMAP model, binary or text, with or without rigs and frames.
+    """Import a COLMAP model, binary or text, with or without rigs and frames, as a map.
 
-    Ids, names, cameras, poses and points stay as they are.
+    Ids, names, cameras, poses and points do not change. The descriptors come from the COLMAP database next to
+    the model, unless another source is given.
+
+    Args:
+        model_path: Folder with cameras, images and points3D.
+        images: Folder of the model's images, to compute SIFT descriptors; short for `ImportOptions.images`.
+        options: Source of the descriptors, and the box.
+        progress: Progress callback.
 
     Raises:
         ModelError: The model is damaged, or its keypoints are not those of the features.
         InputError: A file is missing or damaged.
     """
+    model_path = Path(model_path)
+    if images is not None:
+        options = replace(options, images=Path(images))
     model = read_model(model_path)
     given_box = read_box(options.box) if options.box else None
     if not model.num_points3D():
         raise ModelError(f"{model_path}: the model has no 3D points; triangulate it first")
-    source = _find_source(model_path, model, options, progress)
+    with colmap_warnings():
+        source = _find_source(model_path, model, options, progress)
     _check_keypoints(model, source.features)
     info = MapInfo(
         extractor=source.extractor,
@@ -100,18 +115,18 @@ def _find_source(
         return _from_hloc(model, options)
     if options.images:
         return _from_images(model, options.images, progress)
-    database = options.database or _database_beside(model_path)
+    database = options.database or _database_next_to(model_path)
     return _from_database(model, database)
 
 
-def _database_beside(model_path: Path) -> Path:
-    """COLMAP's habit is PROJECT/database.db and PROJECT/sparse/0."""
+def _database_next_to(model_path: Path) -> Path:
+    """Find the database as COLMAP places it: PROJECT/database.db for PROJECT/sparse/0."""
     folders = [model_path, *model_path.absolute().parents[:2]]
     found = [folder / "database.db" for folder in folders if (folder / "database.db").is_file()]
     if not found:
         raise InputError(
-            f"{model_path}: no database.db beside the model; say where its descriptors come from with "
-            "--database FILE, --features FILE (hloc) or --images DIR"
+            f"{model_path}: no database.db next to the model; give the source of its descriptors: a COLMAP "
+            "database, hloc's features or a folder of images"
         )
     return found[0]
 
@@ -127,7 +142,7 @@ def _from_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
         return _read_database(model, path)
     except (RuntimeError, ValueError) as error:
         raise InputError(
-            f"{path}: not readable as a COLMAP database, which must be whole and writable ({error})"
+            f"{path}: not readable as a COLMAP database, which must be complete and writable ({error})"
         ) from error
 
 
@@ -172,7 +187,7 @@ def _read_database_features(
 
 
 def _frames(keypoints: Float32[np.ndarray, "n columns"]) -> Float32[np.ndarray, "n 2"] | None:
-    """Scales and orientations: the last two of four columns, or what the affine shapes of six tell."""
+    """Scales and orientations: the last two of four columns, or computed from the affine shapes of six."""
     if keypoints.shape[1] == 4:
         return keypoints[:, 2:]
     if keypoints.shape[1] < 6:
@@ -210,13 +225,13 @@ def _check_matches(path: Path, matches: MatchFile, features: Mapping[str, Featur
     for a, b in matches:
         limits = (len(features[a]), len(features[b]))
         if np.any(matches[a, b] >= limits):
-            raise ModelError(f"{path}: the matches of {a!r} and {b!r} name a keypoint that is not there")
+            raise ModelError(f"{path}: the matches of {a!r} and {b!r} refer to a missing keypoint")
 
 
 def _consistent_matches(
     model: pycolmap.Reconstruction, features: Mapping[str, Features], raw: MatchFile
 ) -> dict[tuple[str, str], Int64[np.ndarray, "kept 2"]]:
-    """Those of hloc's unverified matches that fit the epipolar geometry of the model's poses."""
+    """Hloc's unverified matches, filtered by the epipolar geometry of the model's poses."""
     images = {image.name: image for image in _posed_images(model)}
     cameras = {name: camera_of(image) for name, image in images.items()}
     verified = {}
@@ -259,5 +274,5 @@ def _check_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Feat
         if count != described:
             raise ModelError(
                 f"image {image.name!r} has {count} keypoints in the model but {described} in the features: "
-                "they are not of the same run"
+                "they belong to different runs"
             )

@@ -4,9 +4,9 @@ MAP/
   sparse/       COLMAP model, opens in COLMAP, pycolmap and hloc
   features.h5   local features in hloc's layout
   matches.h5    verified matches in hloc's layout; may be missing
-  photos.h5     the photos, small; in maps built without a detector
+  photos.h5     shrunk photos; in maps built without a detector
   global.npz    global descriptors of the images; may be missing
-  points.npz    points to match directly; may be missing, or there instead of features.h5 and matches.h5
+  points.npz    points for direct matching; in reduced maps, often instead of features.h5 and matches.h5
   map.json      format version, extractor and its options, box, unit, origin
 """
 
@@ -21,22 +21,27 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
-from slimsfm.mapping.global_descriptors import read_global_descriptors, write_global_descriptors
-from slimsfm.mapping.map import Map, MapInfo, check_count, check_map
+from slimsfm.mapping.descriptors import (
+    read_global_descriptors,
+    read_point_descriptors,
+    write_global_descriptors,
+    write_point_descriptors,
+)
+from slimsfm.mapping.map import Map, MapInfo, check_map, check_num_features
 from slimsfm.mapping.model import read_model
 from slimsfm.mapping.photo_file import PhotoFile, write_photos
-from slimsfm.mapping.point_file import read_point_descriptors, write_point_descriptors
 
 FORMAT_VERSION = 1
-"""Version of the layout; a map of a later one is refused."""
+"""Version of the format; maps of later versions are rejected."""
 
 
-def read_map(path: Path) -> Map:
+def read_map(path: str | Path) -> Map:
     """Read a map; its features are read from disk when they are needed.
 
     Raises:
-        MapError: This is no map, a part of it is damaged or missing, or it is of a later format.
+        MapError: The folder is not a map, a part is damaged or missing, or the format is of a later version.
     """
+    path = Path(path)
     info = _read_info(path)
     try:
         model = read_model(path / "sparse")
@@ -63,21 +68,24 @@ def read_map(path: Path) -> Map:
         check_map(map_)
         if features is not None:
             for name, image in map_.images.items():
-                check_count(image, features.count(name))
+                check_num_features(image, features.count(name))
     except InputError as error:
         raise MapError(f"{path}: not a usable map: {error}") from error
     return map_
 
 
-def write_map(map: Map, path: Path, *, overwrite: bool = False) -> None:
-    """Write a map beside its place and rename it there, so that there never is half a map.
+def write_map(map: Map, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a map to a folder.
+
+    The map is written next to `path` and renamed, so `path` never holds a part of a map. With `overwrite`, it
+    may be the folder that the map was read from.
 
     Raises:
-        OutputError: The place is taken and `overwrite` is off, or cannot be written.
-        MapError: The map's parts do not fit each other.
+        OutputError: `path` exists and `overwrite` is off, or it cannot be written.
+        MapError: The parts of the map do not belong together.
     """
     check_map(map)
-    with replacing(path, overwrite=overwrite) as partial:
+    with replacing(Path(path), overwrite=overwrite) as partial:
         (partial / "sparse").mkdir(parents=True)
         map.model.write(partial / "sparse")
         if map.features:
@@ -98,14 +106,14 @@ def _write_features(map: Map, path: Path) -> None:
     with FeatureWriter(path) as writer:
         for name, image in map.images.items():
             features = map.features[name]
-            check_count(image, len(features))
+            check_num_features(image, len(features))
             writer.write(name, features)
 
 
 def weigh_map(map: Map) -> int:
-    """Size in bytes that a map takes on disk, found by writing it to a temporary folder.
+    """Size of a map on disk in bytes, measured by writing it to a temporary folder.
 
-    Interruptions are put off until the folder is gone again.
+    Interruptions are deferred until the folder is removed.
     """
     with uninterrupted(), tempfile.TemporaryDirectory(prefix="slimsfm-weigh-") as folder:
         write_map(map, Path(folder) / "map")
@@ -113,7 +121,7 @@ def weigh_map(map: Map) -> int:
 
 
 def bytes_by_part(path: Path) -> dict[str, int]:
-    """Size in bytes of each part of a map on disk, and their `total`."""
+    """Size of each part of a map on disk in bytes, and their `total`."""
     sizes = {
         part.name: sum(file.stat().st_size for file in [part, *part.rglob("*")] if file.is_file())
         for part in sorted(path.iterdir())
@@ -148,8 +156,8 @@ def _read_info(path: Path) -> MapInfo:
         version = data["format_version"]
         if version > FORMAT_VERSION:
             raise MapError(
-                f"{path}: a map of format {version}, but this slimsfm reads formats up to {FORMAT_VERSION}; "
-                "upgrade slimsfm"
+                f"{path}: the map has format {version}, but this slimsfm reads only formats up to "
+                f"{FORMAT_VERSION}; upgrade slimsfm"
             )
         return MapInfo(
             extractor=data["extractor"]["name"],
@@ -160,8 +168,6 @@ def _read_info(path: Path) -> MapInfo:
             origin=data["origin"],
         )
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise MapError(
-            f"{path}: not a map (it has no map.json); make one with `slimsfm build` or `import`"
-        ) from error
+        raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise MapError(f"{file}: damaged ({error}); build or import the map again") from error

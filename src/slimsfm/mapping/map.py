@@ -1,9 +1,10 @@
-"""The map: an SfM model, its local features and the object's box."""
+"""The map: an SfM model with local features and the object's box."""
 
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -15,13 +16,15 @@ from slimsfm.errors import MapError
 from slimsfm.features import Features
 from slimsfm.geometry import Box
 
+MapKind = Literal["full", "images", "points", "images and points"]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapInfo:
-    """What a map says of itself, in its `map.json`."""
+    """Metadata of a map, stored in its `map.json`."""
 
     extractor: str
-    """Name of the extractor whose features the map holds; queries are extracted with the same."""
+    """Name of the extractor of the map's features and of the queries'."""
 
     extractor_options: dict = field(default_factory=dict)
     """Options of the extractor."""
@@ -30,46 +33,46 @@ class MapInfo:
     """The object's box in the map's frame."""
 
     box_source: str
-    """Where the box comes from: "given" or "estimated"."""
+    """Source of the box: "given" or "estimated"."""
 
     unit: str = "unknown"
-    """The unit of the map's frame: "metre", or "unknown" where SfM left the scale open."""
+    """Unit of the map's frame: "metre", or "unknown" if SfM left the scale open."""
 
     origin: str
-    """A sentence on where the map came from."""
+    """A sentence that says how the map was made."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
-    """Which keypoints of an image see which points of the map."""
+    """Keypoints of an image that observe points of the map."""
 
     rows: Ids
     """Rows of the image's features, ascending."""
 
     points: Ids
-    """For each of them the row of the point in `Map.points3D_in_world`."""
+    """Row of the observed point in `Map.points3D_in_world`, per keypoint."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointDescriptors:
-    """Points of a map that queries are matched against directly, each with one descriptor."""
+    """Points of a map for direct matching, with one descriptor per point."""
 
     points: Ids
     """Rows of the points in `Map.points3D_in_world`, ascending."""
 
     descriptors: Descriptors
-    """For each of them its descriptor."""
+    """Descriptor per point, of unit length."""
 
     directions: Float32[np.ndarray, "n 3"] | None = None
-    """For each of them where it was seen from: the mean of the unit vectors towards the cameras that observe
-    it, the shorter the more these differ; None in maps of old, which tell nothing of it."""
+    """Viewing direction per point: the mean of the unit vectors towards the cameras that observe it, which is
+    short if these vectors differ much. None in older maps."""
 
     distinct: Mask | None = None
-    """Which of them look like no other point of the full map; the others prove little of a pose. None in maps
-    of old."""
+    """Whether a point looks unlike all other points of the full map; points with look-alikes are weak
+    evidence for a pose. None in older maps."""
 
     def __getitem__(self, rows: Ids) -> "PointDescriptors":
-        """Some of them, in this order."""
+        """Select points by row, in this order."""
         return PointDescriptors(
             points=self.points[rows],
             descriptors=self.descriptors[rows],
@@ -80,54 +83,82 @@ class PointDescriptors:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GlobalDescriptors:
-    """What the reference images look like as a whole."""
+    """Global descriptors (VLAD) of the reference images, which rank them by similarity to a query."""
 
     vocabulary: Float32[np.ndarray, "words d"]
-    """The words that global descriptors are made by, see `features.vlad`."""
+    """Cluster centers of local descriptors, see `features.vlad`."""
 
     descriptors: Float32[np.ndarray, "images values"]
-    """For each reference image, in order of name, its global descriptor, of unit length."""
+    """Global descriptor per reference image in order of name, of unit length."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Map:
-    """Everything that a query is localized against. Nothing in it changes."""
+    """Everything that localization needs. Maps are immutable."""
 
     model: pycolmap.Reconstruction
     """The SfM model; keypoint i of an image is row i of its features."""
 
     features: Mapping[str, Features]
-    """Local features by image name; may be read from disk on access. Empty in a map for direct matching
-    alone: its images have poses but no keypoints, its points no tracks."""
+    """Local features by image name; may be read from disk on access. Empty in a map for direct matching only:
+    its images have poses but no keypoints, and its points have no tracks."""
 
     point_descriptors: PointDescriptors | None = None
-    """What queries are matched against directly; None where it has to be made from `features`."""
+    """Descriptors for direct matching; None if they have to be computed from `features`."""
 
     matches: Mapping[tuple[str, str], IndexPairs] = field(default_factory=dict)
-    """Verified matches by pair of image names; empty where the map has none."""
+    """Verified matches by pair of image names; may be empty."""
 
     photos: Mapping[str, Image] = field(default_factory=dict)
-    """The reference photos by image name, small; just in maps built without a detector."""
+    """Shrunk reference photos by image name; only in maps built without a detector."""
 
     global_descriptors: GlobalDescriptors | None = None
-    """By what reference images that resemble a query are found; None where it has to be made anew."""
+    """Global descriptors for retrieval; None if they have to be computed from `features`."""
 
     info: MapInfo
     """Extractor, box, unit and origin."""
 
+    unregistered: tuple[str, ...] = ()
+    """Names of the photos given to `build_map` that could not be registered; not stored on disk."""
+
+    @property
+    def kind(self) -> MapKind:
+        """Which parts the map holds: "full", or what it was reduced to.
+
+        "points" have descriptors for direct matching. "images" have features, and some points are observed by
+        a single image, which SfM never reconstructs.
+        """
+        if self.point_descriptors is not None:
+            return "images and points" if self.features else "points"
+        tracks = (point.track.length() for point in self.model.points3D.values())
+        return "images" if min(tracks, default=2) < 2 else "full"
+
+    def describe(self) -> str:
+        """Kind and size of the map: "200 points for direct matching, reduced from 29 images (...)"."""
+        images = f"{len(self.images)} image{'s' * (len(self.images) != 1)}"
+        if self.kind == "points":
+            points = f"{len(self.point3D_ids)} point{'s' * (len(self.point3D_ids) != 1)}"
+            return f"{points} for direct matching, reduced from {images} ({self.info.origin})"
+        parts = f"{images} with {len(self.point3D_ids)} points"
+        if self.kind == "full":
+            return f"{parts} ({self.info.origin})"
+        if self.point_descriptors is not None:
+            parts += f", {len(self.point_descriptors.points)} of them for direct matching"
+        return f"{parts}, reduced from a larger map ({self.info.origin})"
+
     @property
     def is_for_direct_matching(self) -> bool:
-        """Whether there are points to match but no image features."""
+        """Whether the map holds points for direct matching but no image features."""
         return not self.features and self.point_descriptors is not None
 
     @property
     def box(self) -> Box:
-        """The object's box in the map's frame."""
+        """The object's box in the map's frame, `info.box`."""
         return self.info.box
 
     @cached_property
     def images(self) -> dict[str, pycolmap.Image]:
-        """The reference images, those with a pose, by name in sorted order."""
+        """The reference images (images with a pose) by name, sorted."""
         found = [self.model.image(image_id) for image_id in self.model.reg_image_ids()]
         return {image.name: image for image in sorted(found, key=lambda image: image.name)}
 
@@ -137,24 +168,24 @@ class Map:
 
     @cached_property
     def point3D_ids(self) -> Ids:
-        """Ids of the points, ascending: the order of every array of points."""
+        """Ids of the points, ascending: the order of all arrays of points."""
         return np.array(sorted(self.model.point3D_ids()), dtype=np.int64)
 
     @cached_property
     def points3D_in_world(self) -> Points3D:
-        """Positions of the points."""
+        """Positions of the points in the map's frame."""
         points = self.model.points3D
         return np.array([points[i].xyz for i in self.point3D_ids], np.float64).reshape(-1, 3)
 
     @cached_property
     def colors(self) -> UInt8[np.ndarray, "n 3"]:
-        """RGB of the points."""
+        """Colors of the points, RGB."""
         points = self.model.points3D
         return np.array([points[i].color for i in self.point3D_ids], np.uint8).reshape(-1, 3)
 
     @cached_property
     def observations(self) -> dict[str, Observations]:
-        """The observations of each reference image, by name in sorted order."""
+        """The observations of each reference image by name, sorted."""
         return {name: self._observations(image) for name, image in self.images.items()}
 
     def _observations(self, image: pycolmap.Image) -> Observations:
@@ -165,7 +196,7 @@ class Map:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Equal for maps of equal extractor, box, points, poses, cameras, observations and matched pairs."""
+        """Hash of the extractor, box, points, poses, cameras, observations and matched pairs."""
         digest = hashlib.sha256(repr((self.info.extractor, self.info.extractor_options)).encode())
         for values in (self.box.corners, self.point3D_ids, self.points3D_in_world):
             digest.update(values.tobytes())
@@ -180,13 +211,13 @@ class Map:
 
     @property
     def shared_camera(self) -> pycolmap.Camera | None:
-        """The camera of all reference images, or None where they have several."""
+        """The camera of all reference images, or None if they have several."""
         ids = {image.camera_id for image in self.images.values()}
         return self.model.camera(ids.pop()) if len(ids) == 1 else None
 
 
 def observed(map: Map) -> csr_array:
-    """Which images observe which points: a boolean matrix [images, points]."""
+    """Boolean matrix of shape [images, points]: whether an image observes a point."""
     points = [np.unique(seen.points) for seen in map.observations.values()]
     columns = np.concatenate(points)
     starts = np.concatenate([[0], np.cumsum([len(one) for one in points])])
@@ -196,10 +227,10 @@ def observed(map: Map) -> csr_array:
 
 
 def check_map(map: Map) -> None:
-    """Make sure that a map's parts fit each other.
+    """Check that the parts of a map belong together.
 
     Raises:
-        MapError: There is no reference image or point, or an image's features are missing.
+        MapError: The map has no reference image or no point, or lacks the features of an image.
     """
     if not map.images or not len(map.point3D_ids):
         raise MapError(
@@ -213,23 +244,23 @@ def check_map(map: Map) -> None:
 
 
 def check_has_features(map: Map) -> None:
-    """Make sure that images can be matched with those of a map.
+    """Check that a map has image features.
 
     Raises:
-        MapError: The map was made for direct matching alone.
+        MapError: The map is for direct matching only.
     """
     if map.is_for_direct_matching:
         raise MapError(
             "the map is for direct matching alone: it holds points but no image features; "
-            "use the map that it was made of"
+            "use the map that it was reduced from"
         )
 
 
-def check_count(image: pycolmap.Image, count: int) -> None:
-    """Make sure that an image has as many features as keypoints in the model.
+def check_num_features(image: pycolmap.Image, count: int) -> None:
+    """Check that an image of a model has `count` keypoints, one per feature.
 
     Raises:
-        MapError: It has not.
+        MapError: The numbers differ.
     """
     if count != image.num_points2D():
         raise MapError(

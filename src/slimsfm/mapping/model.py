@@ -1,8 +1,8 @@
-"""Reading COLMAP models, checked beforehand.
+"""Read COLMAP models and check them.
 
-pycolmap trusts the counts in a binary file: one that is cut short makes it run out of memory or abort the
-whole process. So each binary file is walked first, record by record, as COLMAP's "Output Format" describes.
-Some damage it does not notice at all; that is looked for in the model it gives.
+pycolmap trusts the counts in a binary file: a truncated file makes it run out of memory or abort the process.
+So each binary file is first walked record by record, as COLMAP's "Output Format" describes. Damage that
+pycolmap does not notice is searched for in the model that it returns.
 """
 
 import struct
@@ -23,7 +23,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model, binary or text, with or without rigs and frames.
 
     Raises:
-        ModelError: There is no model, or it is damaged.
+        ModelError: The folder holds no model, or the model is damaged.
     """
     suffix = next((s for s in (".bin", ".txt") if (path / f"cameras{s}").is_file()), None)
     if suffix is None:
@@ -50,7 +50,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
 
 
 def _name_images(model: pycolmap.Reconstruction, file: Path) -> None:
-    """Give images their whole names, of which pycolmap reads from text no more than the first word."""
+    """Set the full names of images; pycolmap reads only their first word from text."""
     lines = iter(file.read_text().split("\n"))
     for line in lines:
         if line.strip() and not line.strip().startswith("#"):
@@ -60,16 +60,16 @@ def _name_images(model: pycolmap.Reconstruction, file: Path) -> None:
 
 
 def _fault(model: pycolmap.Reconstruction) -> str | None:
-    """What is wrong with a model that pycolmap could read, if anything is."""
+    """The first fault found in a model that pycolmap could read, or None."""
     if not model.num_reg_images():
         return "the model has no image with a pose"
     for camera_id, camera in sorted(model.cameras.items()):
         if camera.is_spherical():
-            return f"camera {camera_id} is spherical ({camera.model_name}), not one with a lens"
+            return f"camera {camera_id} is spherical ({camera.model_name}), which is not supported"
         if not _is_camera(camera):
-            return f"camera {camera_id} has a size or focal length that no camera has"
+            return f"camera {camera_id} has an impossible size or focal length"
     if not model.is_valid() or _num_track_elements(model) != model.compute_num_observations():
-        return "its points and images do not refer to each other"
+        return "its points and images do not belong together"
     if len({image.name for image in model.images.values()}) < model.num_images():
         return "several of its images have the same name"
     poses = [model.image(image_id).cam_from_world().matrix() for image_id in model.reg_image_ids()]
@@ -93,7 +93,7 @@ def camera_of(image: pycolmap.Image) -> pycolmap.Camera:
     """The camera of an image of a model.
 
     Raises:
-        ModelError: The model does not have it.
+        ModelError: The image has no camera in the model.
     """
     if image.camera is None:
         raise ModelError(f"image {image.name!r} has no camera in the model")
@@ -106,7 +106,7 @@ def _first_line(error: Exception) -> str:
 
 def _check_binary(file: Path, walk: "Walk") -> None:
     if not file.is_file():
-        return  # models from before rigs and frames lack those two files
+        return  # models from before rigs and frames lack these two files
     data = memoryview(file.read_bytes())
     try:
         (count,) = struct.unpack_from("<Q", data, 0)
@@ -156,7 +156,7 @@ def _walk_frame(data: memoryview, position: int) -> int:
 
 
 Walk = Callable[[memoryview, int], int]
-"""Takes a file's bytes and where a record starts, and tells where the next one does."""
+"""Takes the bytes of a file and the start of a record, and returns the start of the next record."""
 
 _WALKS: dict[str, Walk] = {
     "cameras": _walk_camera,

@@ -1,23 +1,29 @@
-"""Which pairs of images to match."""
+"""Choose pairs of images, match them by any matcher, and verify the matches by two-view geometry."""
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from itertools import combinations
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float32
 
-from slimsfm.features import Features, unit_rows
+from slimsfm.arrays import IndexPairs
+from slimsfm.features import Features, Matcher, unit_rows
 from slimsfm.features.vlad import learn_words, vlad
+from slimsfm.progress import ProgressBar, silent, single_step
 
 Pairs = list[tuple[str, str]]
-"""Pairs of image names, each in sorted order, without repetition, sorted."""
+"""Pairs of image names: each pair is sorted, and so is the list, without duplicates."""
 
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 
-_MOST_EXHAUSTIVE = 200  # images, up to which "auto" matches each with every other one
-_WORD_SAMPLES = 50_000  # descriptors that words are learned from
+_MOST_EXHAUSTIVE = 200  # images up to which "auto" is exhaustive
+_CACHED = 256  # images whose features are kept in memory
+_WORD_SAMPLES = 50_000  # descriptors that the vocabulary is learned from
 
 
 def choose_pairs(features: Mapping[str, Features], choice: PairChoice, *, seed: int) -> Pairs:
@@ -32,7 +38,7 @@ def choose_pairs(features: Mapping[str, Features], choice: PairChoice, *, seed: 
 
 
 def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[np.ndarray, "n kd"]:
-    """Describe each image by a vocabulary trained on these very images."""
+    """Global descriptors of images by a vocabulary that is learned from the same images."""
     names = sorted(features)
     share = max(1, _WORD_SAMPLES // len(names))
     generator = np.random.default_rng(seed)
@@ -43,14 +49,14 @@ def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[
 
 
 def exhaustive_pairs(names: Iterable[str]) -> Pairs:
-    """Every image with every other one."""
+    """All pairs of images."""
     return list(combinations(sorted(names), 2))
 
 
 def sequential_pairs(names: Iterable[str], *, overlap: int = 10) -> Pairs:
-    """Each image with the next `overlap` ones and with those 2, 4, 8 ... beyond, as frames of one video.
+    """Each image with the next `overlap` images and with the images 2, 4, 8 ... further on.
 
-    The order is that of the numbers in the names: frame2 comes before frame10.
+    Meant for the frames of a video. Numbers in names count as numbers: frame2 comes before frame10.
     """
     ordered = sorted(names, key=_natural)
     steps = [*range(1, overlap + 1), *(overlap + 2**i for i in range(1, overlap.bit_length() + 1))]
@@ -59,7 +65,7 @@ def sequential_pairs(names: Iterable[str], *, overlap: int = 10) -> Pairs:
 
 
 def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, k: int = 20) -> Pairs:
-    """Each image with the k that look most alike, by the dot product of their global descriptors."""
+    """Each image with the k images of most similar global descriptors, by the dot product."""
     similarities = descriptors @ descriptors.T
     np.fill_diagonal(similarities, -np.inf)
     nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(k, len(names) - 1)]
@@ -70,3 +76,36 @@ def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def match_pairs_with(
+    matcher: Matcher, features: Mapping[str, Features], pairs: Pairs, progress: ProgressBar = silent
+) -> dict[tuple[str, str], IndexPairs]:
+    """Match pairs of images by their features; pairs without a match are omitted."""
+    read = lru_cache(_CACHED)(features.__getitem__)
+    found = {}
+    for a, b in progress(pairs, "match pairs"):
+        matches = matcher.match(read(a), read(b))
+        if len(matches):
+            found[a, b] = matches
+    return found
+
+
+def verify_pairs(
+    database: Path,
+    names: list[str],
+    matches: Mapping[tuple[str, str], IndexPairs],
+    *,
+    seed: int,
+    progress: ProgressBar = silent,
+) -> None:
+    """Write matches to a database whose images are numbered from 1 in order of names, and verify them."""
+    ids = {name: image_id for image_id, name in enumerate(names, start=1)}
+    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+        for (a, b), pairs in sorted(matches.items()):
+            opened.write_matches(ids[a], ids[b], pairs.astype(np.uint32))
+    verifier, geometry = pycolmap.GeometricVerifierOptions(), pycolmap.TwoViewGeometryOptions()
+    verifier.num_threads = 1  # with more, equal matches may give unequal inliers
+    geometry.ransac.random_seed = seed
+    with single_step(progress, "verify matches"):
+        pycolmap.geometric_verification(database, verifier, two_view_geometry_options=geometry)

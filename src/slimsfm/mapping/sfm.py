@@ -1,6 +1,11 @@
 """Structure from Motion by pycolmap, from our features to a model and its verified matches."""
 
-from collections.abc import Mapping
+import logging
+import re
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +17,51 @@ from slimsfm.arrays import IndexPairs
 from slimsfm.errors import ReconstructionError
 from slimsfm.features import Features
 from slimsfm.mapping.pairs import Pairs
-from slimsfm.progress import ProgressBar, silent
+from slimsfm.progress import ProgressBar, counted, silent, single_step
 
 _JITTER_PX, _ON_GRID = 0.05, 1e-3  # pixels
-_BLOCK = 200  # pairs matched between two steps of the progress bar
+_BLOCK = 200  # pairs that COLMAP matches per call
+
+# COLMAP cannot read the photos, because its database names them by numbers; we color points ourselves. After
+# a good model it tries others, of the few remaining images.
+_EXPECTED_WARNINGS = re.compile(r"Could not read image|Requested to use GPU|Discarding reconstruction")
+_LOGGER = logging.getLogger(__name__)
+
+
+@contextmanager
+def colmap_warnings() -> Iterator[None]:
+    """Keep COLMAP's log off standard error, and pass each different warning on to Python's log once.
+
+    The log of COLMAP belongs to the process: what other threads make COLMAP say meanwhile counts too.
+    """
+    log = pycolmap.logging
+    before = log.minloglevel, log.alsologtostderr, log.stderrthreshold
+    with tempfile.TemporaryDirectory(prefix="slimsfm-log-") as folder:
+        log.set_log_destination(log.WARNING, Path(folder) / "colmap")
+        log.minloglevel, log.alsologtostderr, log.stderrthreshold = int(log.WARNING), False, int(log.FATAL)
+        try:
+            yield
+        finally:
+            log.set_log_destination(log.WARNING, "")
+            log.minloglevel, log.alsologtostderr, log.stderrthreshold = before
+            lines = [line for file in Path(folder).iterdir() for line in file.read_text().splitlines()]
+    _pass_on(lines)
+
+
+def _pass_on(log: list[str]) -> None:
+    messages = Counter(found[1] for line in log if (found := re.match(r"[WE]\d{8} .*?\] (.*)", line)))
+    for message, count in messages.items():
+        if not _EXPECTED_WARNINGS.match(message):
+            _LOGGER.warning("COLMAP: %s%s", message, f" ({count} times)" if count > 1 else "")
 
 
 def write_database(
     path: Path, features: Mapping[str, Features], cameras: Mapping[str, pycolmap.Camera]
 ) -> None:
-    """Write images, cameras and features as a COLMAP database, in place of one that may be there.
+    """Write images, cameras and features to a COLMAP database; an existing file is replaced.
 
-    Cameras with equal `camera_id` are one camera. Image ids count from 1 in order of names; in the database
-    they also stand for the names, for COLMAP's lists of pairs cannot hold a name with a space.
+    Cameras with equal `camera_id` are one camera. Image ids count from 1 in order of names. The database also
+    uses them as names, because COLMAP's lists of pairs cannot hold a name with a space.
     """
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
@@ -53,9 +90,9 @@ def _write_features(database: pycolmap.Database, image_id: int, features: Featur
 
 
 def _off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
-    """Keypoints moved by up to a twentieth of a pixel if all lie on a grid of half pixels.
+    """Keypoints, moved by up to 0.05 pixels if all of them lie on a grid of half pixels.
 
-    On an exact grid COLMAP's solver for cameras of unknown focal length may crash the process.
+    On an exact grid, COLMAP's solver for unknown focal lengths may crash the process.
     """
     if np.any(np.abs(2 * keypoints - np.round(2 * keypoints)) > _ON_GRID):
         return keypoints
@@ -64,7 +101,7 @@ def _off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2
 
 
 def put_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Features]) -> None:
-    """Give the images of a model the very keypoints of their features."""
+    """Set the keypoints of a model's images to those of their features, without the shift of `_off_grid`."""
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
         for point, xy in zip(image.points2D, features[image.name].keypoints, strict=True):
@@ -76,30 +113,32 @@ def match_pairs(
 ) -> None:
     """Match pairs of images by their SIFT descriptors and verify the matches by two-view geometry."""
     ids = {name: image_id for image_id, name in enumerate(names, start=1)}
-    blocks = [pairs[start : start + _BLOCK] for start in range(0, len(pairs), _BLOCK)]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = database.with_suffix(".pairs.txt")
-    for block in progress(blocks, f"match {len(pairs)} pairs, {_BLOCK} at a time"):
-        Path(pairing.match_list_path).write_text("".join(f"{ids[a]} {ids[b]}\n" for a, b in block))
-        pycolmap.match_image_pairs(
-            database,
-            matching_options=_matching_options(),
-            pairing_options=pairing,
-            verification_options=verification,
-        )
+    with counted(progress, len(pairs), "match pairs") as advance_to:
+        for start in range(0, len(pairs), _BLOCK):
+            block = pairs[start : start + _BLOCK]
+            Path(pairing.match_list_path).write_text("".join(f"{ids[a]} {ids[b]}\n" for a, b in block))
+            pycolmap.match_image_pairs(
+                database,
+                matching_options=_matching_options(),
+                pairing_options=pairing,
+                verification_options=verification,
+            )
+            advance_to(start + len(block))
 
 
 def _matching_options() -> pycolmap.FeatureMatchingOptions:
     options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = 1  # with more, equal images have now and then not given equal matches
+    options.num_threads = 1  # with more, equal images sometimes give unequal matches
     options.use_gpu = False
     return options
 
 
 def verified_matches(database: Path, names: Mapping[int, str]) -> dict[tuple[str, str], IndexPairs]:
-    """The matches of a database that fit one two-view geometry, by pair of the names given for image ids."""
+    """The verified matches of a database, by pair of the names given for image ids."""
     with pycolmap.Database.open(database) as opened:
         pair_ids, geometries = opened.read_two_view_geometries()
         found = {}
@@ -113,11 +152,13 @@ def verified_matches(database: Path, names: Mapping[int, str]) -> dict[tuple[str
         return {key: found[key][np.argsort(found[key][:, 0], kind="stable")] for key in sorted(found)}
 
 
-def reconstruct(database: Path, names: list[str], workspace: Path, *, seed: int) -> pycolmap.Reconstruction:
-    """Reconstruct the largest model there is of the images of a database.
+def reconstruct(
+    database: Path, names: list[str], workspace: Path, *, seed: int, progress: ProgressBar = silent
+) -> pycolmap.Reconstruction:
+    """Reconstruct the images of a database; returns the largest model.
 
-    Incremental mapping [1]; where it leaves out more than a tenth of the images (a walk along a street gives
-    it no good pair to start from), global mapping [2] is tried as well and the larger model taken.
+    Runs incremental mapping [1]. If this registers fewer than 90 % of the images (a walk along a street has
+    no good initial pair), global mapping [2] runs as well, and the larger model is returned.
 
     Raises:
         ReconstructionError: No two images could be joined to a model.
@@ -127,32 +168,55 @@ def reconstruct(database: Path, names: list[str], workspace: Path, *, seed: int)
         [2] Pan, Barath, Pollefeys and Schoenberger, Global Structure-from-Motion Revisited, ECCV 2024.
     """
     workspace.mkdir(parents=True, exist_ok=True)
-    models = _map_incrementally(database, workspace, seed)
+    models = _map_incrementally(database, workspace, seed, len(names), progress)
     if max((model.num_reg_images() for model in models), default=0) < 0.9 * len(names):
-        models += _map_globally(database, workspace, seed)
+        with single_step(progress, "reconstruct globally"):
+            models += _map_globally(database, workspace, seed)
     if not models:
         raise ReconstructionError(
-            f"no model could be reconstructed from these {len(names)} images; take more, with more overlap, "
-            "or of an object with more texture"
+            f"no model could be reconstructed from these {len(names)} images; take more images, with more "
+            "overlap, or of an object with more texture"
         )
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     _name_images(model, names)
     return model
 
 
-# One thread, of the libraries below as well: with more, pycolmap's mappers do not give equal models for equal
-# input, and are hardly faster.
+# Mapping runs on one thread, also in the libraries below: with more, equal input gives unequal models, and
+# mapping is hardly faster.
 
 
-def _map_incrementally(database: Path, workspace: Path, seed: int) -> list[pycolmap.Reconstruction]:
+def _map_incrementally(
+    database: Path, workspace: Path, seed: int, num_images: int, progress: ProgressBar
+) -> list[pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     options.extract_colors = False
     options.min_model_size = 3
     pycolmap.set_random_seed(seed)
-    with threadpool_limits(1):
-        return list(pycolmap.incremental_mapping(database, workspace, workspace, options=options).values())
+    registered = 0  # in the model under way; the progress is that of the largest model
+
+    def start_model() -> None:
+        nonlocal registered
+        registered = 2
+        advance_to(registered)
+
+    def add_image() -> None:
+        nonlocal registered
+        registered += 1
+        advance_to(registered)
+
+    with threadpool_limits(1), counted(progress, num_images, "register images") as advance_to:
+        models = pycolmap.incremental_mapping(
+            database,
+            workspace,
+            workspace,
+            options=options,
+            initial_image_pair_callback=start_model,
+            next_image_callback=add_image,
+        )
+    return list(models.values())
 
 
 def _map_globally(database: Path, workspace: Path, seed: int) -> list[pycolmap.Reconstruction]:
@@ -176,11 +240,12 @@ def triangulate(
     cam_from_world: Mapping[str, pycolmap.Rigid3d],
     *,
     seed: int,
+    progress: ProgressBar = silent,
 ) -> pycolmap.Reconstruction:
     """Triangulate the matches of a database from known poses and cameras, which stay as they are.
 
     Raises:
-        ReconstructionError: Not one point could be triangulated.
+        ReconstructionError: No point could be triangulated.
     """
     model = _posed_model(database, names, cam_from_world)
     workspace.mkdir(parents=True, exist_ok=True)
@@ -189,7 +254,8 @@ def triangulate(
     options.random_seed = options.triangulation.random_seed = seed
     pycolmap.set_random_seed(seed)
     options.extract_colors = False
-    model = pycolmap.triangulate_points(model, database, workspace, workspace, options=options)
+    with single_step(progress, "triangulate points"):
+        model = pycolmap.triangulate_points(model, database, workspace, workspace, options=options)
     if not model.num_points3D():
         raise ReconstructionError("no point could be triangulated; are these the poses of these images?")
     _name_images(model, names)

@@ -1,43 +1,44 @@
-"""A map of some of the images: what the paper calls X' and P'."""
+"""Parts of a map: some of its images (the paper's X' and P'), or some of its points for direct matching."""
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Image, IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features import Features
-from slimsfm.mapping.map import GlobalDescriptors, Map, check_has_features
+from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors, check_has_features
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 
 def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) -> Map:
-    """Keep some reference images and the points they see.
+    """Keep some reference images and the points that they observe.
 
     A point stays if at least `min_track_length` of the kept images observe it; 1 gives the paper's P'. Ids,
-    names, cameras, poses and positions stay as they are; tracks lose the observations of dropped images.
+    names, cameras, poses and positions do not change; tracks lose the observations of dropped images.
 
     Raises:
-        InputError: A name is not that of a reference image, or no name is given.
-        MapError: The map was made for direct matching alone.
+        InputError: `names` is empty or contains a name that is not in the map.
+        MapError: The map is for direct matching only.
     """
     check_has_features(map)
     kept = sorted(set(names))
     if not kept:
-        raise InputError("no image was chosen to be kept")
+        raise InputError("no image to keep was given")
     for name in kept:
         if name not in map.images:
             raise InputError(
-                f"image {name!r} is not in the map; `slimsfm info MAP --images` lists those that are"
+                f"image {name!r} is not in the map; `slimsfm info MAP --images` lists its images"
             )
     chosen = frozenset(kept)
-    features: Mapping[str, Features] = Selection(map.features, chosen.__contains__)
-    matches: Mapping[tuple[str, str], IndexPairs] = Selection(map.matches, chosen.issuperset)
-    photos: Mapping[str, Image] = Selection(map.photos, chosen.__contains__)
+    features: Mapping[str, Features] = FilteredMapping(map.features, chosen.__contains__)
+    matches: Mapping[tuple[str, str], IndexPairs] = FilteredMapping(map.matches, chosen.issuperset)
+    photos: Mapping[str, Image] = FilteredMapping(map.photos, chosen.__contains__)
     model = _subset_model(map, kept, min_track_length)
     return replace(
         map,
@@ -59,8 +60,47 @@ def _global_descriptors_of(map: Map, chosen: frozenset[str]) -> GlobalDescriptor
     )
 
 
-class Selection(Mapping[Key, Value]):
-    """The entries of a mapping whose keys are wanted, read from it on access."""
+def direct_map(map: Map, chosen: PointDescriptors) -> Map:
+    """Keep some points for direct matching, and drop everything that only serves to match images.
+
+    Images keep their name, camera and pose but lose their keypoints and features. Points keep their id,
+    position and color but lose their tracks.
+    """
+    model = copy_images(map, list(map.images), keypoints=False)
+    copy_points(map, model, {point3D_id: [] for point3D_id in map.point3D_ids[chosen.points].tolist()})
+    points = np.arange(len(chosen.points), dtype=np.int64)
+    descriptors = replace(chosen, points=points)
+    return replace(
+        map,
+        model=model,
+        features={},
+        matches={},
+        photos={},
+        global_descriptors=None,
+        point_descriptors=descriptors,
+    )
+
+
+def with_points(slim: Map, map: Map, chosen: PointDescriptors) -> Map:
+    """Add points for direct matching to a map of some images, so that it serves both ways of matching.
+
+    Args:
+        slim: A map of some of the images of `map`.
+        map: The full map.
+        chosen: The points to add, as rows of `map`.
+    """
+    kept = {image.image_id for image in slim.images.values()}
+    wanted = map.point3D_ids[chosen.points]
+    model = pycolmap.Reconstruction(slim.model)
+    missing = np.setdiff1d(wanted, slim.point3D_ids)
+    copy_points(map, model, {i: track_in(map, i, kept) for i in missing.tolist()})
+    joined = replace(slim, model=model)
+    rows = np.searchsorted(joined.point3D_ids, wanted)
+    return replace(joined, point_descriptors=replace(chosen, points=rows))
+
+
+class FilteredMapping(Mapping[Key, Value]):
+    """A view of the entries of a mapping whose keys are wanted; values are read on access."""
 
     def __init__(self, source: Mapping[Key, Value], wanted: Callable[[Key], bool]) -> None:
         self._source = source
@@ -90,17 +130,17 @@ def _subset_model(map: Map, names: list[str], min_track_length: int) -> pycolmap
 
 
 def track_in(map: Map, point3D_id: int, image_ids: Container[int]) -> list[pycolmap.TrackElement]:
-    """The observations of a point in some images."""
+    """The observations of a point by some images."""
     return [one for one in map.model.points3D[point3D_id].track.elements if one.image_id in image_ids]
 
 
 def copy_images(map: Map, names: list[str], *, keypoints: bool = True) -> pycolmap.Reconstruction:
-    """A model of some reference images, their cameras and rigs, but no points yet.
+    """Copy some reference images, their cameras and rigs to a model without points.
 
     Args:
         map: The map.
-        names: The images.
-        keypoints: Keep the images' keypoints.
+        names: Names of the images.
+        keypoints: Copy the keypoints as well.
     """
     model = pycolmap.Reconstruction()
     kept = {map.images[name].image_id: map.images[name] for name in names}
@@ -118,7 +158,7 @@ def copy_images(map: Map, names: list[str], *, keypoints: bool = True) -> pycolm
 def copy_points(
     map: Map, model: pycolmap.Reconstruction, tracks: Mapping[int, list[pycolmap.TrackElement]]
 ) -> None:
-    """Add points of a map, by id and with these tracks, to a model of some of its images."""
+    """Copy points of a map, given by id with their new tracks, to a model of some of its images."""
     points = map.model.points3D
     for point3D_id, track in tracks.items():
         point = points[point3D_id]
@@ -130,7 +170,7 @@ def copy_points(
 def _copy_cameras_and_rigs(
     source: pycolmap.Reconstruction, target: pycolmap.Reconstruction, kept: dict[int, pycolmap.Image]
 ) -> None:
-    """Copy what the kept images need; a rig stays whole, with all of its cameras."""
+    """Copy the cameras, rigs and frames of the kept images; a rig keeps all of its cameras."""
     frames = {image.frame_id: source.frame(image.frame_id) for image in kept.values()}
     rigs = {frame.rig_id: source.rig(frame.rig_id) for frame in frames.values()}
     sensors = {sensor.id for rig in rigs.values() for sensor in rig.sensor_ids()}
@@ -143,7 +183,7 @@ def _copy_cameras_and_rigs(
 
 
 def _frame_of(frame: pycolmap.Frame, kept: dict[int, pycolmap.Image]) -> pycolmap.Frame:
-    """The frame with only those of its images that are kept."""
+    """A copy of the frame with only the kept images."""
     copy = pycolmap.Frame(frame_id=frame.frame_id, rig_id=frame.rig_id)
     for data in frame.data_ids:
         if data.id in kept:

@@ -8,9 +8,8 @@ import numpy as np
 from slimsfm.arrays import Ids
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import Map, PointDescriptors
-from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.subset import direct_map, keep_images
 from slimsfm.reduction.forecast import Prediction
 
 DOMINATING = "dominating"

@@ -21,8 +21,8 @@ from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.geometry import corner_error, reprojection_errors
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import Target, unite
+from slimsfm.mapping.descriptors import quantize
 from slimsfm.mapping.map import Map, observed
-from slimsfm.mapping.point_file import quantize
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.selection.leave_one_out import LeftOut

@@ -3,7 +3,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.mapping.cameras import guess_cameras
+from slimsfm.mapping.extraction import guess_cameras
 
 
 @pytest.fixture
@@ -25,22 +25,22 @@ def groups(cameras):
     return [camera.camera_id for camera in cameras.values()]
 
 
-def test_auto_shares_a_camera_where_size_and_focal_length_agree(folder):
+def test_auto_shares_a_camera_if_size_and_focal_length_agree(folder):
     cameras = guess_cameras(folder, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"], "auto")
     assert groups(cameras) == [1, 1, 2, 3]
     assert (cameras["d.jpg"].width, cameras["d.jpg"].height) == (40, 60)
 
 
-def test_shared_is_one_camera_even_where_the_lens_was_zoomed(folder):
+def test_shared_is_one_camera_in_spite_of_zoom(folder):
     assert groups(guess_cameras(folder, ["a.jpg", "b.jpg", "c.jpg"], "shared")) == [1, 1, 1]
 
 
-def test_per_image_is_a_camera_each(folder):
+def test_per_image_gives_each_image_its_camera(folder):
     assert groups(guess_cameras(folder, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"], "per-image")) == [1, 2, 3, 4]
 
 
 def test_images_of_two_sizes_cannot_share_a_camera(folder):
-    with pytest.raises(InputError, match=r"a\.jpg has 60x40 pixels, d\.jpg 40x60.*--camera auto"):
+    with pytest.raises(InputError, match=r"a\.jpg has 60x40 pixels, d\.jpg 40x60.*be 'auto'"):
         guess_cameras(folder, ["a.jpg", "d.jpg"], "shared")
 
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from slimsfm.errors import InputError, MapError
 from slimsfm.features import unit_rows
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.mapping.direct import direct_map
+from slimsfm.mapping.descriptors import quantize, read_point_descriptors, write_point_descriptors
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.point_file import quantize, read_point_descriptors, write_point_descriptors
+from slimsfm.mapping.subset import direct_map
 
 SHAPES = {"count": st.integers(1, 12), "dimensions": st.integers(1, 33), "seed": st.integers(0, 10**6)}
 
@@ -24,7 +24,7 @@ def random_descriptors(count, dimensions, seed, *, signed=True):
 
 
 def values_of(quantized):
-    """The values that the codes stand for, decoded by hand."""
+    """The values of the codes, decoded by hand."""
     found = np.empty((len(quantized.codes), 2 * quantized.codes.shape[1]))
     found[:, ::2], found[:, 1::2] = np.divmod(quantized.codes, 16)
     step = (quantized.high - quantized.low) / 15
@@ -42,7 +42,7 @@ def test_each_value_is_off_by_half_a_step_at_most(count, dimensions, seed, signe
 
 
 @given(**SHAPES)
-def test_what_is_restored_is_of_unit_length(count, dimensions, seed):
+def test_restored_descriptors_have_unit_length(count, dimensions, seed):
     quantized = quantize(random_descriptors(count, dimensions, seed))
     restored = quantized.restore()
     assert restored.shape == (count, dimensions)
@@ -55,7 +55,7 @@ def test_what_is_restored_is_of_unit_length(count, dimensions, seed):
 
 @pytest.mark.parametrize("value", [-0.25, 0.25])
 @pytest.mark.parametrize("dimensions", [15, 16])
-def test_descriptors_all_of_one_value_stay_so(value, dimensions):
+def test_constant_descriptors_stay_constant(value, dimensions):
     restored = quantize(np.full((3, dimensions), value, np.float32)).restore()
     assert restored == pytest.approx(np.full((3, dimensions), np.sign(value) / np.sqrt(dimensions)))
 
@@ -82,7 +82,7 @@ def written(tmp_path):
     return path
 
 
-def test_equal_points_are_equal_bytes(written, tmp_path):
+def test_equal_points_give_equal_bytes(written, tmp_path):
     again = tmp_path / "again.npz"
     found = PointDescriptors(points=np.arange(0, 80, 2), descriptors=random_descriptors(40, 32, 0))
     write_point_descriptors(again, found)
@@ -93,11 +93,11 @@ def test_a_file_cut_short_anywhere_is_refused(written):
     whole = written.read_bytes()
     for end in range(0, len(whole), 37):
         written.write_bytes(whole[:end])
-        with pytest.raises(InputError, match=r"points.npz: damaged .*make the map again"):
+        with pytest.raises(InputError, match=r"points.npz: damaged .*reduce the full map again"):
             read_point_descriptors(written, 80)
 
 
-def test_a_file_with_a_bad_byte_is_read_as_it_was_or_refused(written):
+def test_a_file_with_a_bad_byte_is_read_correctly_or_refused(written):
     whole, before = written.read_bytes(), read_point_descriptors(written, 80)
     rng = np.random.default_rng(0)
     for place in range(0, len(whole), 3):
@@ -112,7 +112,7 @@ def test_a_file_with_a_bad_byte_is_read_as_it_was_or_refused(written):
 
 @pytest.mark.parametrize("num_points", [0, 1, 78])
 def test_a_file_of_another_model_is_refused(written, num_points):
-    with pytest.raises(InputError, match=f"not those of {num_points} points"):
+    with pytest.raises(InputError, match=f"do not belong to {num_points} points"):
         read_point_descriptors(written, num_points)
     assert len(read_point_descriptors(written, 79).points) == 40
 
@@ -136,7 +136,7 @@ def _with(part, value):
         _with("codes", np.zeros(9, np.uint8)),
     ],
 )
-def test_parts_that_do_not_fit_are_refused(written, harm):
+def test_inconsistent_parts_are_refused(written, harm):
     with np.load(written) as file:
         parts = dict(file)
     harm(parts)
@@ -160,6 +160,6 @@ def test_a_map_with_damaged_points_names_their_file(exact, tmp_path, kind):
             np.save(file, points)
     else:
         path.write_bytes({"text": b"no points here", "nothing": b""}.get(kind, whole[: len(whole) // 2]))
-    with pytest.raises(MapError, match=r"points.npz: damaged .*make the map again") as refusal:
+    with pytest.raises(MapError, match=r"points.npz: damaged .*reduce the full map again") as refusal:
         read_map(tmp_path / "map")
     assert str(path) in str(refusal.value)

@@ -1,0 +1,182 @@
+"""Descriptors of points and of whole images, and their compact files: four bits per dimension.
+
+On photos, four bits per dimension lose neither accuracy nor localized queries. Product quantization needs a
+table, which is larger than the descriptors of a few hundred points.
+"""
+
+import lzma
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from slimsfm.arrays import Descriptors, Mask
+from slimsfm.errors import InputError
+from slimsfm.features import unit_rows
+from slimsfm.features.vlad import learn_words, vlad
+from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors
+
+_LEVELS = 15
+_SAMPLE = 500  # descriptors per image that the vocabulary is learned from
+_INT8_MAX = np.iinfo(np.int8).max
+UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError),
+    *(BadZipFile, RuntimeError, zlib.error, lzma.LZMAError),  # raised by zip files and their parts
+)
+"""Exceptions that reading a damaged file of arrays may raise."""
+
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes lack context
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Quantized:
+    """Descriptors with values rounded to 16 equidistant levels."""
+
+    codes: UInt8[np.ndarray, "n bytes"]
+    """Two values per byte, the first in the upper half; the last half byte may be padding."""
+
+    dimensions: int
+    """Number of values per descriptor."""
+
+    low: float
+    """Value of code 0."""
+
+    high: float
+    """Value of code 15."""
+
+    def restore(self) -> Descriptors:
+        """Restore the descriptors, rounded and of unit length."""
+        halves = np.stack([self.codes >> 4, self.codes & _LEVELS], axis=2).reshape(len(self.codes), -1)
+        values = halves[:, : self.dimensions].astype(np.float32)
+        return unit_rows(self.low + (self.high - self.low) / _LEVELS * values)
+
+
+def quantize(descriptors: Descriptors) -> Quantized:
+    """Round descriptors to four bits per dimension; at least one descriptor is required."""
+    low, high = float(descriptors.min()), float(descriptors.max())
+    steps = (descriptors - low) * (_LEVELS / max(high - low, 1e-12))
+    codes = np.round(steps).astype(np.uint8)
+    if codes.shape[1] % 2:
+        codes = np.pad(codes, ((0, 0), (0, 1)))
+    packed = codes[:, ::2] << 4 | codes[:, 1::2]
+    return Quantized(codes=packed, dimensions=descriptors.shape[1], low=low, high=high)
+
+
+def pack(rows: Descriptors) -> dict[str, np.ndarray]:
+    """Quantize and compress rows of unit length to arrays for a file; at least one row is required."""
+    quantized = quantize(rows)
+    packed = lzma.compress(quantized.codes.tobytes(), filters=_FILTERS)
+    return {
+        "codes": np.frombuffer(packed, np.uint8),
+        "range": np.array([quantized.low, quantized.high]),
+        "dimensions": np.array(quantized.dimensions, np.uint32),
+    }
+
+
+def unpack(arrays: Mapping[str, np.ndarray], count: int) -> Descriptors:
+    """Restore `count` rows from the arrays of `pack`.
+
+    Raises:
+        ValueError: The arrays hold another number of rows. Damaged arrays raise any of `UNREADABLE`.
+    """
+    codes = np.frombuffer(lzma.decompress(arrays["codes"].tobytes()), np.uint8)
+    (low, high), dimensions = arrays["range"].tolist(), int(arrays["dimensions"])
+    return Quantized(
+        codes=codes.reshape(count, (dimensions + 1) // 2), dimensions=dimensions, low=low, high=high
+    ).restore()
+
+
+def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
+    """Write descriptors of points, quantized and compressed."""
+    steps = np.diff(points.points, prepend=-1).astype(np.uint32)  # mostly 1, which compresses well
+    arrays: dict[str, Any] = pack(points.descriptors)
+    arrays["points"] = np.frombuffer(lzma.compress(steps.tobytes()), np.uint8)
+    if points.directions is not None:
+        arrays["directions"] = np.round(_INT8_MAX * points.directions).astype(np.int8)
+    if points.distinct is not None:
+        arrays["distinct"] = np.packbits(points.distinct)
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
+    """Read descriptors of points of a model with `num_points` points.
+
+    Raises:
+        InputError: The file is damaged, or belongs to another model.
+    """
+    try:
+        with path.open("rb") as opened, np.load(opened) as file:
+            steps = np.frombuffer(lzma.decompress(file["points"].tobytes()), np.uint32)
+            points = np.cumsum(steps, dtype=np.int64) - 1
+            if not len(points) or points[-1] >= num_points or not steps.all():
+                raise ValueError(f"its rows do not belong to {num_points} points")
+            return PointDescriptors(
+                points=points,
+                descriptors=unpack(file, len(points)),
+                directions=_unpack_directions(file, len(points)) if "directions" in file else None,
+                distinct=_unpack_bits(file["distinct"], len(points)) if "distinct" in file else None,
+            )
+    except UNREADABLE as error:
+        raise InputError(f"{path}: damaged ({error}); reduce the full map again") from error
+
+
+def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[np.ndarray, "n 3"]:
+    return arrays["directions"].reshape(count, 3).astype(np.float32) / _INT8_MAX
+
+
+def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
+    if len(packed) != (count + 7) // 8:
+        raise ValueError(f"{len(packed)} bytes do not hold one bit per point for {count} points")
+    return np.unpackbits(packed, count=count).astype(bool)
+
+
+def with_global_descriptors(map: Map) -> Map:
+    """Add a global descriptor per reference image to a map."""
+    return replace(map, global_descriptors=describe_images(map))
+
+
+def describe_images(map: Map, seed: int = 0) -> GlobalDescriptors:
+    """Compute a global descriptor (VLAD) per reference image.
+
+    The vocabulary is learned from the map's own descriptors. Only keypoints that observe a point count, so
+    that background outside the map does not make images similar. O(observations).
+    """
+    words = learn_words(np.concatenate([_seen(map, name)[:_SAMPLE] for name in map.images]), seed)
+    rows = np.stack([vlad(_seen(map, name), words) for name in map.images])
+    return GlobalDescriptors(vocabulary=words, descriptors=rows)
+
+
+def _seen(map: Map, name: str) -> Descriptors:
+    return unit_rows(map.features[name].descriptors[map.observations[name].rows])
+
+
+def write_global_descriptors(path: Path, global_descriptors: GlobalDescriptors) -> None:
+    """Write global descriptors, quantized and compressed like those of points."""
+    with path.open("wb") as file:
+        arrays: dict[str, Any] = {
+            "words": global_descriptors.vocabulary,
+            **pack(global_descriptors.descriptors),
+        }
+        np.savez(file, **arrays)
+
+
+def read_global_descriptors(path: Path, num_images: int) -> GlobalDescriptors:
+    """Read global descriptors of `num_images` images.
+
+    Raises:
+        InputError: The file is damaged, or belongs to another map.
+    """
+    try:
+        with path.open("rb") as opened, np.load(opened) as file:
+            words, rows = file["words"].astype(np.float32), unpack(file, num_images)
+        if words.ndim != 2 or rows.shape[1] != words.size:
+            raise ValueError(f"rows of {rows.shape[1]} values do not match words of shape {words.shape}")
+        return GlobalDescriptors(vocabulary=words, descriptors=rows)
+    except UNREADABLE as error:
+        raise InputError(f"{path}: damaged ({error}); build or import the map again") from error
