@@ -19,9 +19,8 @@ import torch
 from random_weights import write_random_weights
 
 from slimsfm.features import Features, load_extractor, load_matcher, unit_rows
-from slimsfm.features.exporting import export_method
-from slimsfm.networks.devices import DEVICE
-from slimsfm.weights import FOLDER
+from slimsfm.features.registry import export_method
+from slimsfm.weights import DEVICE, FOLDER
 
 EXTRACTORS = {
     "superpoint": ("superpoint", {}),

@@ -28,15 +28,14 @@ from slimsfm.evaluation.outcomes import Outcomes, join, outcomes_of
 from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
 from slimsfm.evaluation.scores import Scores, score
 from slimsfm.features import Features
-from slimsfm.features.image_matching import load_image_matcher
-from slimsfm.features.superpoint import SuperPoint
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.photo_file import shrink_photo
 from slimsfm.mapping.subset import keep_images
-from slimsfm.networks.superpoint import describe_pixels
+from slimsfm.methods.loftr.image_matching import load_image_matcher
+from slimsfm.methods.superpoint import SuperPoint, describe_pixels
 from slimsfm.photos import read_image
 from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
 from slimsfm.weights import FOLDER, WEIGHTS

@@ -20,9 +20,9 @@ from transformers import (
 )
 
 from slimsfm.features import lightglue
-from slimsfm.networks.loftr import make_network
-from slimsfm.networks.onepose import GraphAttentionMatcher
-from slimsfm.networks.onepose_plus import OnePosePlusMatcher
+from slimsfm.methods.loftr.network import make_network
+from slimsfm.methods.onepose.network import GraphAttentionMatcher
+from slimsfm.methods.onepose_plus.network import OnePosePlusMatcher
 
 
 def write_random_weights(folder: Path, seed: int = 0) -> Path:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from slimsfm.features.image_matching import ImageMatches
 from slimsfm.geometry import project
+from slimsfm.methods.loftr.image_matching import ImageMatches
 from slimsfm.synthetic.trajectory import look_at
 
 RADIUS = 1.0

@@ -3,15 +3,10 @@ import pytest
 
 from scenes import BOX, camera, poses
 from slimsfm.geometry import project
-from slimsfm.localization.crop import (
-    Region,
-    Sighting,
-    best_region,
-    crop_region,
-    region_by_matches,
-    region_of_box,
-)
+from slimsfm.localization.guided_matching import region_of_box
+from slimsfm.methods.onepose.crop import Region, best_region, crop_region, region_by_matches
 from slimsfm.synthetic.trajectory import look_at
+from slimsfm.tracking.templates import Sighting
 
 
 def region(left, top, right, bottom) -> Region:

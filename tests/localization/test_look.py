@@ -3,8 +3,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from slimsfm.localization.crop import Region, Sighting
-from slimsfm.localization.look import Look, find, spread
+from slimsfm.methods.onepose.crop import Look, Region
+from slimsfm.tracking.templates import Sighting, find, spread
 
 
 def look(*points: int, at: float) -> Look:

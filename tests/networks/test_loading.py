@@ -8,9 +8,12 @@ from torch import nn  # noqa: E402
 
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.networks import loading  # noqa: E402
-from slimsfm.networks.devices import DEVICE, choose_device  # noqa: E402
+from slimsfm.networks.devices import choose_device
 from slimsfm.networks.loading import load_network, load_state  # noqa: E402
-from slimsfm.weights import FOLDER  # noqa: E402
+from slimsfm.weights import (
+    DEVICE,
+    FOLDER,
+)
 
 
 class Explosive:

@@ -18,14 +18,16 @@ from transformers import SuperPointConfig, SuperPointForKeypointDetection  # noq
 
 from networks.seeded import fill  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.features import Features, lightglue, load_extractor, unit_rows  # noqa: E402
-from slimsfm.features.exporting import export_method  # noqa: E402
-from slimsfm.features.superpoint import SuperPoint  # noqa: E402
+from slimsfm.features import Features, lightglue, load_extractor, unit_rows
+from slimsfm.features.registry import export_method
+from slimsfm.methods.aliked import AlikedMaps, Deformable, dense_maps
+from slimsfm.methods.superpoint import SuperPoint
 from slimsfm.networks import onnx  # noqa: E402
-from slimsfm.networks.aliked import AlikedMaps, Deformable, dense_maps  # noqa: E402
-from slimsfm.networks.devices import DEVICE  # noqa: E402
 from slimsfm.networks.onnx import Exportable, onnx_run, write_onnx  # noqa: E402
-from slimsfm.weights import FOLDER  # noqa: E402
+from slimsfm.weights import (
+    DEVICE,
+    FOLDER,
+)
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
 

@@ -12,11 +12,11 @@ from slimsfm.evaluation.methods import Method, parse_method
 from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare, queries_of
 from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Trial, map_path
 from slimsfm.evaluation.variants import Making, Variant, parse_variant
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.graph.source import Edges
 from slimsfm.localization import LocalizationOptions
+from slimsfm.localization.localizer import supports
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
@@ -211,7 +211,7 @@ def _cells(
     """Strategy by strategy, variant by variant."""
     for strategy in subject.bench.options.strategies:
         for variant, maps in stored.items():
-            if maps and _is_possible(strategy, maps[0].map):
+            if maps and supports(strategy, maps[0].map):
                 trials = tuple(_trial(subject, one, strategy, queries) for one in maps)
                 yield Cell(method=str(subject.method), strategy=strategy, variant=variant, trials=trials)
 
@@ -224,9 +224,3 @@ def _trial(subject: _Subject, stored: _StoredMap, strategy: str, queries: Sequen
         map_bytes=stored.bytes,
         outcomes=evaluate(stored.map, queries, strategy, matcher, progress, subject.sequences.model),
     )
-
-
-def _is_possible(strategy: str, map: Map) -> bool:
-    if strategy == "direct":
-        return map.info.extractor not in DETECTOR_FREE
-    return not map.is_for_direct_matching

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from slimsfm.features.methods import EXTRACTORS, MATCHERS, plugins
+from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from slimsfm.domination import Solution
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
@@ -172,7 +171,7 @@ def _random(making: Making, count: int | None) -> list[Map]:
 
 
 def _default(making: Making, _: None) -> list[Map]:
-    if making.map.info.extractor in DETECTOR_FREE:
+    if not making.map.has_keypoints:
         return []
     options = FrontierOptions(uses=("direct",))
     found = frontier(making.map, None, making.weigh, options, making.progress)
@@ -188,7 +187,7 @@ def _points_settings(words: list[str]) -> tuple[int, str]:
 
 
 def _points(making: Making, settings: tuple[int, str]) -> list[Map]:
-    if making.map.info.extractor in DETECTOR_FREE:
+    if not making.map.has_keypoints:
         return []
     count, selector = settings
     problem = selection_problem(making.map, LeftOut(making.map), making.progress)

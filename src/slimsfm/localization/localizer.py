@@ -1,17 +1,15 @@
 """From a query image to its pose."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from threading import local
 from time import perf_counter
 
 import numpy as np
 import pycolmap
-from jaxtyping import Shaped
 
-from slimsfm.arrays import Descriptors, Image, Points2D, Points3D
+from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
-from slimsfm.features.methods import DETECTOR_FREE, importing, plugins, resolve
+from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.gravity import Gravity
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.guided_matching import extract_near
@@ -24,8 +22,8 @@ from slimsfm.pose import PoseEstimate, RansacOptions
 STRATEGIES = {
     "direct": "slimsfm.localization.direct:Direct",
     "exhaustive": "slimsfm.localization.exhaustive:Exhaustive",
-    "onepose": "slimsfm.localization.onepose:OnePose",
-    "onepose++": "slimsfm.localization.onepose_plus:OnePosePlus",
+    "onepose": "slimsfm.methods.onepose.strategy:OnePoseStrategy",
+    "onepose++": "slimsfm.methods.onepose_plus.strategy:OnePosePlusStrategy",
     "progressive": "slimsfm.localization.progressive:Progressive",
     "retrieval": "slimsfm.localization.retrieval:Retrieval",
 }
@@ -65,7 +63,7 @@ class LocalizationOptions:
         """The strategy to use with a map."""
         if self.strategy != "auto":
             return self.strategy
-        if map.info.extractor in DETECTOR_FREE:
+        if not map.has_keypoints:
             return "exhaustive"
         return "progressive" if map.point_descriptors is None else "direct"
 
@@ -78,7 +76,24 @@ def load_strategy(name: str, map: Map, options: MatchingOptions = MatchingOption
         MapError: It cannot work with such a map.
     """
     with importing(f"strategy {name!r}"):
-        return resolve({**plugins("strategy"), **STRATEGIES}[name])(map, options)
+        return _strategy_class(name)(map, options)
+
+
+def supports(strategy: str, map: Map) -> bool:
+    """Whether a map has what the strategy of this name requires.
+
+    Raises:
+        InputError: A package that the strategy needs is missing.
+    """
+    if strategy == "auto":
+        return True
+    with importing(f"strategy {strategy!r}"):
+        requires = getattr(_strategy_class(strategy), "requires", "features")
+    return map.has_keypoints if requires == "points" else not map.is_for_direct_matching
+
+
+def _strategy_class(name: str) -> Callable[[Map, MatchingOptions], Strategy]:
+    return load_object({**plugins("strategy"), **STRATEGIES}[name])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +153,6 @@ class Localizer:
         self.map = map
         self._options = options
         self.extractor = load_extractor(map.info.extractor, map.info.extractor_options)
-        self._memory = local()
         self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
         self._search = Search(map, self._strategy, options.ransac, options.focal)
 
@@ -192,7 +206,7 @@ class Localizer:
     @property
     def looks_at_images(self) -> bool:
         """Whether features alone are not enough: the strategy looks at queries itself."""
-        return isinstance(self._strategy, PoseGuided) or self.map.info.extractor in DETECTOR_FREE
+        return isinstance(self._strategy, PoseGuided) or not self.map.has_keypoints
 
     def localize_features(
         self,
@@ -229,19 +243,11 @@ class Localizer:
             features = features[order]
         return Query(
             keypoints=features.keypoints.astype(np.float64),
-            descriptors=self._unit_rows(features.descriptors),
+            descriptors=unit_rows(features.descriptors),
             features=features,
             camera=camera,
             image=image,
         )
-
-    def _unit_rows(self, descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
-        """Rows of unit length, in memory that each thread uses again: fresh pages are dear."""
-        memory = getattr(self._memory, "rows", None)
-        count, dimensions = descriptors.shape
-        if memory is None or len(memory) < count or memory.shape[1] != dimensions:
-            memory = self._memory.rows = np.empty((count, dimensions), np.float32)
-        return unit_rows(descriptors, out=memory[:count])
 
     def camera_of(self, image: Image, given: pycolmap.Camera | None = None) -> pycolmap.Camera:
         """The intrinsics of an image: those given, else those of the map, scaled.

@@ -10,7 +10,6 @@ import pycolmap
 from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import Ids
-from slimsfm.features import nearest_for
 from slimsfm.localization.landmarks import choose_landmarks
 from slimsfm.localization.matching import match_target
 from slimsfm.localization.point_descriptors import describe_points
@@ -28,7 +27,7 @@ class Progressive:
     """Matches with what promises most, then with ever more; with all reference images when unsure."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._nearest = nearest_for(map.info.extractor)
+        self._nearest = map.descriptor_metric
         self._references = References(map, options)
         self._ranking = Ranking(map)
         landmarks = describe_points(map)[choose_landmarks(map)]

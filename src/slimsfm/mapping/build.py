@@ -3,27 +3,22 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Protocol, runtime_checkable
 
 import pycolmap
 
+from slimsfm.arrays import Image
 from slimsfm.errors import InputError
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
-from slimsfm.features.image_matching import Photo, load_image_matcher
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.box import estimate_box, read_box
-from slimsfm.mapping.build_keypoint_free import PhotoFolder, build_without_keypoints
 from slimsfm.mapping.cameras import CameraSharing, guess_cameras
-from slimsfm.mapping.cell_keypoints import Matches
 from slimsfm.mapping.extraction import color_points, extract_features
 from slimsfm.mapping.global_descriptors import with_global_descriptors
-from slimsfm.mapping.image_pairs import choose_image_pairs
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.pair_matching import match_pairs_with, verify_pairs
-from slimsfm.mapping.pairs import PairChoice, choose_pairs
-from slimsfm.mapping.photo_file import shrink_photo
+from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs
 from slimsfm.mapping.sfm import (
     match_pairs,
     put_keypoints,
@@ -34,7 +29,6 @@ from slimsfm.mapping.sfm import (
 )
 from slimsfm.photos import list_images
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.weights import find_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,12 +125,16 @@ def build_map(
     extractor = _extractor(options)
     workspace.mkdir(parents=True, exist_ok=True)
     cameras = known.cameras if known else guess_cameras(images, names, options.camera)
-    work = _Work(images, names, workspace, cameras, known, progress)
-    make_parts = _parts_without_keypoints if extractor.name in DETECTOR_FREE else _parts_with_keypoints
-    parts = make_parts(work, extractor, options)
+    work = BuildWork(
+        images=images, names=names, workspace=workspace, cameras=cameras, known=known, progress=progress
+    )
+    if isinstance(extractor, ModelBuilder):
+        parts = extractor.build_model(work, options)
+    else:
+        parts = _parts_with_keypoints(work, extractor, options)
     info = MapInfo(
-        extractor=extractor.name,
-        extractor_options=extractor.options,
+        extractor=parts.extractor.name,
+        extractor_options=parts.extractor.options,
         box=given_box or estimate_box(parts.model),
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
@@ -153,27 +151,63 @@ def _build(map: Map, names: list[str]) -> Build:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Parts:
-    """What images become."""
-
-    model: pycolmap.Reconstruction
-    features: Mapping[str, Features]
-    matches: Matches
-    photos: Mapping[str, Photo] = field(default_factory=dict)
-
-
-class _Work(NamedTuple):
-    """What both ways of building need."""
+class BuildWork:
+    """What a model is built from."""
 
     images: Path
+    """Folder of the photos."""
+
     names: list[str]
+    """Names of the photos to use, relative to the folder."""
+
     workspace: Path
+    """Folder for intermediate files."""
+
     cameras: Mapping[str, pycolmap.Camera]
+    """Intrinsics by image name; images with equal `camera_id` share a camera."""
+
     known: KnownPoses | None
+    """Known poses, if any: then points are triangulated and nothing else is estimated."""
+
     progress: ProgressBar
+    """Progress callback."""
 
 
-def _parts_with_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapParts:
+    """A model and the data that its map stores with it."""
+
+    extractor: Extractor
+    """Extractor that the map records for queries."""
+
+    model: pycolmap.Reconstruction
+    """The SfM model; keypoint i of an image is row i of its features."""
+
+    features: Mapping[str, Features]
+    """Local features by image name."""
+
+    matches: Matches
+    """Verified matches by pair of image names."""
+
+    photos: Mapping[str, Image] = field(default_factory=dict)
+    """Small photos by image name, for extractors without keypoints."""
+
+
+@runtime_checkable
+class ModelBuilder(Protocol):
+    """An extractor that builds the model of a map itself, because it finds no keypoints."""
+
+    def build_model(self, work: BuildWork, options: BuildOptions) -> MapParts:
+        """Build a model from photos.
+
+        Raises:
+            InputError: A photo, a mask or an option cannot be used.
+            ReconstructionError: The images give no model.
+        """
+        ...
+
+
+def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
     features, colors = extract_features(work.images, names, extractor, options.masks, output, work.progress)
     database = _match(work, features, options)
@@ -185,38 +219,17 @@ def _parts_with_keypoints(work: _Work, extractor: Extractor, options: BuildOptio
     put_keypoints(model, features)
     color_points(model, colors)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    return _Parts(model=model, features=features, matches=matches)
-
-
-def _parts_without_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
-    photos = PhotoFolder(work.images, work.names)
-    poses = work.known.cam_from_world if work.known else None
-    made = build_without_keypoints(
-        photos,
-        choose_image_pairs(work.names, options.pairs, poses),
-        load_image_matcher(extractor.name, extractor.options),
-        work.cameras,
-        work.workspace,
-        cam_from_world=poses,
-        masks=options.masks,
-        seed=options.seed,
-        progress=work.progress,
-    )
-    limit = extractor.options["max_image_size"]
-    small = {name: shrink_photo(photos[name], limit) for name in made.features}
-    return _Parts(model=made.model, features=made.features, matches=made.matches, photos=small)
+    return MapParts(extractor=extractor, model=model, features=features, matches=matches)
 
 
 def _extractor(options: BuildOptions) -> Extractor:
     wishes: dict = {"max_features": options.max_features, "max_image_size": options.max_image_size}
-    if options.extractor in DETECTOR_FREE and find_weights("loftr-onepose++"):
-        wishes["weights"] = "loftr-onepose++"  # the map then serves OnePose++ as well
     return load_extractor(
         options.extractor, {key: value for key, value in wishes.items() if value is not None}
     )
 
 
-def _match(work: _Work, features: FeatureFile, options: BuildOptions) -> Path:
+def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Path:
     database = work.workspace / "database.db"
     write_database(database, features, work.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)

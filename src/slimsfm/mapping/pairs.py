@@ -6,13 +6,16 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from slimsfm.features import Features, unit_rows
 from slimsfm.features.vlad import learn_words, vlad
 
 Pairs = list[tuple[str, str]]
 """Pairs of image names, each in sorted order, without repetition, sorted."""
+
+Matches = Mapping[tuple[str, str], Int64[np.ndarray, "_ 2"]]
+"""Pairs (row of the first image's keypoints, row of the second's), by pair of image names."""
 
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 
