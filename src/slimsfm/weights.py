@@ -37,8 +37,7 @@ class Runtime:
     """Device of the networks; auto: a GPU if there is one."""
 
     def __post_init__(self) -> None:
-        if self.device not in get_args(DeviceName):
-            raise InputError(f"device must be auto, cpu or cuda, got {self.device!r}")
+        _check_device(self.device)
         if self.weights is not None and not self.weights.is_dir():
             raise InputError(
                 f"{self.weights}: no such folder of weights; set the weights folder to an existing one "
@@ -56,7 +55,13 @@ class Runtime:
         """
         folder = weights or os.environ.get(FOLDER)
         name: str = device or os.environ.get(DEVICE) or "auto"
+        _check_device(name)
         return cls(weights=Path(folder) if folder else None, device=name)  # pyright: ignore[reportArgumentType]
+
+
+def _check_device(name: str) -> None:
+    if name not in get_args(DeviceName):
+        raise InputError(f"device must be auto, cpu or cuda, got {name!r}")
 
 
 _used: Runtime | None = None

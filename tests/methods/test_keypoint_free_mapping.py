@@ -12,7 +12,7 @@ from slimsfm.errors import InputError
 from slimsfm.geometry import reprojection_errors
 from slimsfm.mapping.pairs import exhaustive_pairs
 from slimsfm.methods.loftr.cells import in_tiles, match_without_keypoints
-from slimsfm.methods.loftr.extractor import choose_image_pairs, neighbouring_pairs
+from slimsfm.methods.loftr.extractor import choose_image_pairs, neighboring_pairs
 from slimsfm.methods.loftr.image_matching import EncodedImage, ImageMatcher
 from slimsfm.methods.loftr.mapping import KeypointFreeModel, build_without_keypoints
 from slimsfm.methods.loftr.rays import rays_of, refine_depths
@@ -215,19 +215,19 @@ def test_pairs_in_tiles_are_the_same_pairs_and_reread_few_images():
 
 def test_neighbours_are_near_and_look_elsewhere():
     ring = {f"{i:02d}": pose for i, pose in enumerate(ring_of_cameras(12))}
-    assert neighbouring_pairs(ring) == neighbouring_pairs(dict(reversed(ring.items())))
+    assert neighboring_pairs(ring) == neighboring_pairs(dict(reversed(ring.items())))
     twins = {**ring, "00 again": ring["00"]}
-    assert ("00", "00 again") not in neighbouring_pairs(twins)
+    assert ("00", "00 again") not in neighboring_pairs(twins)
     many = {
         f"{i:03d}": pycolmap.Rigid3d(pose.rotation, pose.translation)
         for i, pose in enumerate(ring_of_cameras(12) * 4)
     }
-    assert len(neighbouring_pairs(many)) < len(exhaustive_pairs(many)) / 2
+    assert len(neighboring_pairs(many)) < len(exhaustive_pairs(many)) / 2
 
 
 def test_pairs_of_similar_images_cannot_be_asked_for():
     names = [f"{number:02d}" for number in range(40)]
-    with pytest.raises(InputError, match="--pairs exhaustive"):
+    with pytest.raises(InputError, match="set pairs to exhaustive"):
         choose_image_pairs(names, "similar", None)
     assert choose_image_pairs(names[:30], "auto", None) == exhaustive_pairs(names[:30])
     assert len(choose_image_pairs(names, "auto", None)) < len(exhaustive_pairs(names))

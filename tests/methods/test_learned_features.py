@@ -1,4 +1,4 @@
-"""What learned extractors and matchers keep to, with seeded random weights where there are no others."""
+"""The contracts of learned extractors and matchers, with seeded weights if no trained ones are available."""
 
 import json
 from dataclasses import replace
@@ -16,23 +16,23 @@ pytest.importorskip("transformers")
 
 
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.features import (
+from slimsfm.features import (  # noqa: E402
     Extractor,
     Features,
     Matcher,
     load_extractor,
     load_matcher,
     match_nearest,
-    nearest_for,
     unit_rows,
 )
-from slimsfm.methods.superglue import superglue_state
-from slimsfm.methods.superpoint import superpoint_state
+from slimsfm.features.registry import descriptor_metric_of  # noqa: E402
+from slimsfm.methods.superglue import superglue_state  # noqa: E402
+from slimsfm.methods.superpoint import superpoint_state  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
 RANDOM = ["disk", "superpoint"]
-STEP = 32  # pixels by which pictures are moved: every network's grid falls onto itself
+STEP = 32  # shift of pictures in pixels, a multiple of every network's grid
 
 
 @pytest.fixture(scope="session")
@@ -43,7 +43,7 @@ def random_weights(tmp_path_factory):
 
 @pytest.fixture
 def weights(request, monkeypatch, random_weights):
-    """The folder of weights for the extractor that a test is about."""
+    """The weights folder for the extractor under test."""
     folder = SHARED if request.getfixturevalue("name") == "aliked" else random_weights
     if not folder.is_dir():
         pytest.skip("needs the trained ALIKED weights in ../shared/weights, which are not here")
@@ -81,8 +81,8 @@ class TestExtractors:
         whole, half = extractor.extract(textured), extractor.extract(textured, mask)
         assert np.array_equal(half.keypoints, whole.keypoints[whole.keypoints[:, 0] >= 160])
 
-    def test_moving_the_picture_moves_keypoints_by_that(self, name, textured):
-        """Exactly for SuperPoint; what ALIKED and DISK do at the rim is felt, weakly, everywhere."""
+    def test_shifting_the_picture_shifts_keypoints(self, name, textured):
+        """Exactly for SuperPoint; with ALIKED and DISK the border has a weak influence everywhere."""
         extractor = load_extractor(name, {"max_features": 4000})
         picture = np.zeros((240 + STEP, 320 + STEP, 3), np.uint8)
         here, there = picture.copy(), picture.copy()
@@ -97,8 +97,8 @@ class TestExtractors:
             assert near.all()
             assert np.abs(offsets).max() < 1e-3
 
-    def test_shrinking_is_undone_about_the_corner_of_the_image(self, name, textured):
-        """A picture twice as large, which is shrunk to the first, has its keypoints at twice the places."""
+    def test_keypoints_are_scaled_back_about_the_corner_of_the_image(self, name, textured):
+        """A picture of twice the size, shrunk to the first, has keypoints at twice the coordinates."""
         extractor = load_extractor(name, {"max_features": 300, "max_image_size": 320})
         large = textured.repeat(2, axis=0).repeat(2, axis=1)
         one, two = extractor.extract(textured), extractor.extract(large)
@@ -111,7 +111,7 @@ class TestExtractors:
 
 
 def inner(features: Features, shift: int) -> np.ndarray:
-    """Keypoints away from the rim of the picture, where its surroundings are seen, as if it had not moved."""
+    """Keypoints away from the border of the picture, shifted back."""
     pixels = features.keypoints - np.float32(shift)
     return pixels[((pixels > 90) & (pixels < (230, 150))).all(axis=1)]
 
@@ -155,14 +155,14 @@ def test_every_matcher_keeps_the_contract(method, features, dimensions):
     assert matcher.match(empty, other).shape == matcher.match(other, empty).shape == (0, 2)
 
 
-def test_nearest_is_match_nearest_as_suits_the_features():
+def test_nearest_uses_the_metric_of_the_features():
     rng = np.random.default_rng(1)
     one = described(rng, 50, 128)
     noisy = unit_rows(one.descriptors.astype(np.float32) + 0.03 * rng.normal(size=(50, 128)))
     other = Features(keypoints=one.keypoints, descriptors=noisy, scores=one.scores, image_size=one.image_size)
     pairs = load_matcher("nearest", "aliked").match(one, other)
     assert len(pairs) > 40
-    expected = match_nearest(unit_rows(one.descriptors), unit_rows(noisy), nearest_for("aliked"))
+    expected = match_nearest(unit_rows(one.descriptors), unit_rows(noisy), descriptor_metric_of("aliked"))
     assert np.array_equal(pairs, expected)
 
 
@@ -178,10 +178,10 @@ def test_features_that_a_matcher_does_not_know_are_named(method, features, known
 
 
 @pytest.mark.usefixtures("untrained")
-def test_sift_of_old_maps_lacks_what_lightglue_looks_at():
-    of_old = replace(described(np.random.default_rng(0), 20, 128), frames=None)
+def test_sift_features_olderer_maps_lack_what_lightglue_needs():
+    older = replace(described(np.random.default_rng(0), 20, 128), frames=None)
     with pytest.raises(InputError, match="scales and orientations of SIFT features"):
-        load_matcher("lightglue", "sift").match(of_old, of_old)
+        load_matcher("lightglue", "sift").match(older, older)
 
 
 def test_an_unknown_matcher_is_named():

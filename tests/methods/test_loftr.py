@@ -8,11 +8,12 @@ pytest.importorskip("kornia")
 
 from networks.seeded import fill  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.methods.loftr.image_matching import EncodedImage, ImageMatcher
-from slimsfm.methods.loftr.matcher import Loftr
-from slimsfm.methods.loftr.network import coarse_tokens, confidences, make_network
+from slimsfm.methods.loftr.image_matching import EncodedImage, ImageMatcher  # noqa: E402
+from slimsfm.methods.loftr.matcher import Loftr  # noqa: E402
+from slimsfm.methods.loftr.network import coarse_tokens, confidences, make_network  # noqa: E402
+from slimsfm.weights import FOLDER  # noqa: E402
 
-GOLDEN = np.load(Path(__file__).parents[1] / "networks" / "golden" / "loftr.npz")
+GOLDEN = np.load(Path(__file__).parent / "golden" / "loftr.npz")
 CLOSE = 1e-4  # of confidences: processors round differently, by up to 3e-5 so far
 BLOCKS = np.random.default_rng(2).integers(0, 256, (38, 58), dtype=np.uint8)
 PICTURE = np.kron(BLOCKS, np.ones((4, 4), np.uint8))
@@ -20,7 +21,7 @@ IMAGE1, IMAGE2 = PICTURE[:128, :200], PICTURE[8:152, 16:200]
 
 
 def seeded(weights, threshold=0.01):
-    """A matcher with made-up weights."""
+    """A matcher with seeded weights."""
     is_plain = weights == "loftr"
     network = make_network(window=5 if is_plain else 9, coarse_context=is_plain).eval()
     fill(network, 0)
@@ -42,7 +43,7 @@ def for_maps():
 
 
 def in_golden_order(points2D):
-    """Row by row of cells, as the authors' code tells matches."""
+    """Row by row of cells, as the authors' code orders matches."""
     return np.lexsort(points2D.T)
 
 
@@ -141,7 +142,7 @@ def test_images_without_matches_give_none(plain):
 
 
 def test_published_files_are_found_by_name_and_hold_the_framework_s_prefix(plain, tmp_path, monkeypatch):
-    monkeypatch.setenv("SLIMSFM_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv(FOLDER, str(tmp_path))
     state = {f"matcher.{key}": value for key, value in plain.network.state_dict().items()}
     torch.save({"state_dict": state}, tmp_path / "loftr_outdoor.ckpt")
     loaded = Loftr(threshold=0.01).match_images(IMAGE1, IMAGE2)

@@ -5,10 +5,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from slimsfm.networks.onepose import mutual_matches, state_of
-
 from networks.seeded import fill  # noqa: E402
-from slimsfm.methods.onepose.network import GraphAttentionMatcher
+from slimsfm.methods.onepose.network import GraphAttentionMatcher, mutual_matches  # noqa: E402
+from slimsfm.networks.loading import matcher_state  # noqa: E402
 
 GOLDEN = np.load(Path(__file__).parent / "golden" / "onepose.npz")
 POINTS, LEAVES, KEYPOINTS = 90, 8, 70
@@ -72,7 +71,7 @@ def test_checkpoint_of_the_training_framework_becomes_the_state_dict(network):
     state = network.state_dict()
     other = {"extractor.conv1a.weight": torch.zeros(1)}
     checkpoint = {"epoch": 3, "state_dict": {**other, **{f"matcher.{key}": state[key] for key in state}}}
-    assert state_of(checkpoint).keys() == state.keys()
+    assert matcher_state(checkpoint).keys() == state.keys()
 
 
 def test_confidences_and_matches_are_those_of_the_authors(confidence):

@@ -5,10 +5,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from slimsfm.networks.onepose_plus import state_of
-
 from networks.seeded import fill  # noqa: E402
-from slimsfm.methods.onepose_plus.network import CoarseToFine, OnePosePlusMatcher
+from slimsfm.methods.onepose_plus.network import CoarseToFine, OnePosePlusMatcher  # noqa: E402
+from slimsfm.networks.loading import matcher_state  # noqa: E402
 
 GOLDEN = np.load(Path(__file__).parent / "golden" / "onepose_plus.npz")
 
@@ -43,7 +42,7 @@ def test_state_dict_is_that_of_the_published_weights(network):
 def test_checkpoint_of_the_training_framework_becomes_the_state_dict(network):
     state = network.state_dict()
     checkpoint = {"epoch": 3, "state_dict": {f"matcher.{key}": value for key, value in state.items()}}
-    assert state_of(checkpoint).keys() == state.keys()
+    assert matcher_state(checkpoint).keys() == state.keys()
 
 
 def test_confidences_matches_and_places_are_those_of_the_authors(found):

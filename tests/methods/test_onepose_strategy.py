@@ -8,34 +8,36 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from slimsfm.networks.onepose import mutual_matches
-
 from networks.seeded import fill  # noqa: E402
 from scenes import BOX, camera, exact_map, poses  # noqa: E402
-from slimsfm.datasets.onepose import OnePose
 from slimsfm.errors import InputError, MapError  # noqa: E402
 from slimsfm.features import Features, unit_rows  # noqa: E402
 from slimsfm.geometry import corner_error, project  # noqa: E402
-from slimsfm.localization import onepose
 from slimsfm.localization.direct import Direct  # noqa: E402
-from slimsfm.localization.guided_matching import region_of_box
 from slimsfm.localization.search import Search  # noqa: E402
-from slimsfm.localization.strategy import PoseGuided, Query, Strategy  # noqa: E402
+from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy  # noqa: E402
 from slimsfm.mapping.map import Map  # noqa: E402
 from slimsfm.mapping.subset import keep_images  # noqa: E402
-from slimsfm.methods.onepose.network import GraphAttentionMatcher
+from slimsfm.methods.onepose.crop import box_region  # noqa: E402
+from slimsfm.methods.onepose.network import GraphAttentionMatcher  # noqa: E402
+from slimsfm.methods.onepose.strategy import ObjectFinder, OnePoseStrategy, object_views  # noqa: E402
 from slimsfm.pose import RansacOptions, estimate_pose  # noqa: E402
 from slimsfm.synthetic.trajectory import look_at  # noqa: E402
+from slimsfm.weights import Runtime, use_runtime  # noqa: E402
 
 POINTS = 40
 VIEW = poses(17)[5]
-SIDES = [region_of_box(BOX, pose, camera()).side for pose in poses(6)]
-AS_LARGE = (round(np.median(SIDES)), round(np.median(SIDES)), 3)  # as the references show the object
+SIDES = [box_region(BOX, pose, camera()).side for pose in poses(6)]
+AS_LARGE = (
+    round(np.median(SIDES)),
+    round(np.median(SIDES)),
+    3,
+)  # as large as in the references
 AWAY = look_at(np.array([5.0, 0, 0]), np.array([10.0, 0, 0]))
 
 
 class DotExtractor:
-    """Finds the dots of `picture` and describes each as the point that it shows."""
+    """Finds the dots of `picture`, each with the descriptor of its point."""
 
     name, options = "superpoint", {}
 
@@ -59,7 +61,7 @@ class DotExtractor:
 
 
 def picture(map_: Map) -> np.ndarray:
-    """The points as dots of five pixels, each of a colour of its own."""
+    """The points as dots of five pixels, each of its own color."""
     image = np.zeros((480, 640, 3), np.uint8)
     for point, (x, y) in enumerate(project(map_.points3D_in_world, VIEW, camera()).astype(int)):
         image[y - 2 : y + 3, x - 2 : x + 3] = 10 + 5 * point, 245 - 5 * point, 255
@@ -78,13 +80,17 @@ def scene() -> Map:
     return replace(made, features=features, info=replace(made.info, extractor="superpoint"))
 
 
-@pytest.fixture(autouse=True)
-def extractor(scene, monkeypatch) -> DotExtractor:
+@pytest.fixture
+def extractor(scene) -> DotExtractor:
     name, seen = next(iter(scene.observations.items()))
     descriptors = scene.features[name].descriptors[seen.rows[np.argsort(seen.points)]]
-    made = DotExtractor(descriptors)
-    monkeypatch.setattr(onepose, "load_extractor", lambda *_: made)
-    return made
+    return DotExtractor(descriptors)
+
+
+@pytest.fixture
+def make(extractor):
+    """Creates the strategy with the extractor of dots."""
+    return partial(OnePoseStrategy, extractor=extractor)
 
 
 def write(folder: Path, network: GraphAttentionMatcher) -> Path:
@@ -102,13 +108,13 @@ def made_up(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def by_likeness(tmp_path_factory) -> Path:
-    """Weights with which nearly nothing but the likeness of descriptors counts."""
+    """Weights with which almost only the similarity of descriptors counts."""
     network = GraphAttentionMatcher().requires_grad_(False)
     for key, value in network.state_dict().items():
         if ".mlp.3." in key:
             value.zero_()
         elif key.endswith(".W"):
-            value[:, 0] = -1.0  # observations that are there are preferred to ones all over
+            value[:, 0] = -1.0  # real observations are preferred to filled-up ones
         elif key.endswith(".a"):
             value[0] = 1.0
     network.final_proj.weight[:, :, 0] = torch.eye(256)
@@ -117,8 +123,9 @@ def by_likeness(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def weights(monkeypatch, by_likeness) -> None:
-    monkeypatch.setenv("SLIMSFM_WEIGHTS", str(by_likeness))
+def weights(by_likeness):
+    with use_runtime(Runtime(weights=by_likeness, device="cpu")):
+        yield
 
 
 def query(scene: Map, extractor: DotExtractor) -> Query:
@@ -141,7 +148,7 @@ def strongest(of: Query, count: int) -> Query:
     )
 
 
-def all_rounds(strategy: OnePose, of: Query, map_: Map) -> list:
+def all_rounds(strategy: OnePoseStrategy, of: Query, map_: Map) -> list:
     rounds, pose, found = strategy.rounds(of), None, []
     while True:
         try:
@@ -156,17 +163,17 @@ def errors(matches, of: Query, map_: Map) -> np.ndarray:
     return np.linalg.norm(matches.pixels(of) - right, axis=1)
 
 
-def test_the_scene_is_localized(scene, extractor):
-    strategy = OnePose(scene)
+def test_the_scene_is_localized(make, scene, extractor):
+    strategy = make(scene)
     found = Search(scene, strategy, RansacOptions()).run(query(scene, extractor), camera()).best
     assert corner_error(found.pose.cam_from_world, VIEW, BOX) < 0.01
     assert found.pose.num_inliers > 0.8 * POINTS
     assert found.confidence > 0.9
 
 
-def test_it_looks_closely_where_images_say_that_the_object_is_and_then_where_the_pose_does(scene, extractor):
+def test_it_looks_closely_where_images_locate_the_object_then_where_the_pose_does(make, scene, extractor):
     of = query(scene, extractor)
-    one, other = all_rounds(OnePose(scene), of, scene)
+    one, other = all_rounds(make(scene), of, scene)
     assert extractor.seen == [AS_LARGE] * 2
     assert 0 < one.references == other.references <= len(scene.images)
     for matches in (one, other):
@@ -174,18 +181,17 @@ def test_it_looks_closely_where_images_say_that_the_object_is_and_then_where_the
     assert len(other) >= len(one) > 0.8 * POINTS
 
 
-def test_without_an_image_its_features_must_do(scene, extractor):
+def test_without_an_image_only_its_features_are_used(make, scene, extractor):
     of = replace(query(scene, extractor), image=None)
-    (found,) = all_rounds(OnePose(scene), of, scene)
+    (found,) = all_rounds(make(scene), of, scene)
     assert not extractor.seen
     assert np.isin(found.pixels(of), of.keypoints).all()
     assert len(found) > 0.8 * POINTS
 
 
-def test_with_any_weights_equal_queries_get_equal_matches(scene, extractor, made_up, monkeypatch):
-    monkeypatch.setenv("SLIMSFM_WEIGHTS", str(made_up))
-    monkeypatch.setattr(onepose, "mutual_matches", partial(mutual_matches, threshold=0.0))
-    one, two = OnePose(scene), OnePose(scene)
+def test_with_any_weights_equal_queries_get_equal_matches(make, scene, extractor, made_up):
+    with use_runtime(Runtime(weights=made_up, device="cpu")):
+        one, two = make(scene, threshold=0.0), make(scene, threshold=0.0)
     assert isinstance(one, Strategy)
     assert isinstance(one, PoseGuided)
     of = query(scene, extractor)
@@ -195,24 +201,24 @@ def test_with_any_weights_equal_queries_get_equal_matches(scene, extractor, made
         assert np.array_equal(a.pixels(of), b.pixels(of))
 
 
-def test_each_round_knows_the_points_of_those_before(scene, extractor):
+def test_each_round_keeps_the_points_of_earlier_rounds(make, scene, extractor):
     of = query(scene, extractor)
-    for before, matches in pairwise(all_rounds(OnePose(scene), of, scene)):
+    for before, matches in pairwise(all_rounds(make(scene), of, scene)):
         assert np.isin(before.points, matches.points).all()
         assert len(np.unique(matches.points)) == len(matches)
 
 
-def test_where_the_part_gives_no_pose_the_whole_is_looked_at(scene, extractor):
+def test_the_whole_image_is_used_if_the_region_gives_no_pose(make, scene, extractor):
     of = query(scene, extractor)
-    rounds = OnePose(scene).rounds(of)
+    rounds = make(scene).rounds(of)
     next(rounds)
     found = rounds.send(None)
     assert extractor.seen == [AS_LARGE]
     assert np.isin(found.pixels(of), of.keypoints).all()
 
 
-def test_near_a_pose_it_looks_where_that_puts_the_box(scene, extractor):
-    strategy, of = OnePose(scene), query(scene, extractor)
+def test_near_a_pose_it_looks_where_the_pose_projects_the_box(make, scene, extractor):
+    strategy, of = make(scene), query(scene, extractor)
     found = strategy.near(of, poses(18)[5])
     assert extractor.seen == [AS_LARGE]
     assert np.median(errors(found, of, scene)) < 0.5
@@ -222,7 +228,8 @@ def test_near_a_pose_it_looks_where_that_puts_the_box(scene, extractor):
 
 
 def test_the_finder_finds_the_box(scene, extractor):
-    finder, right = OnePose(scene)._finder, region_of_box(BOX, VIEW, camera())
+    finder = ObjectFinder(scene, MatchingOptions(), object_views(scene))
+    right = box_region(BOX, VIEW, camera())
     found = finder.find(query(scene, extractor)).region
     assert found.corners == pytest.approx(right.corners, abs=0.25 * right.side)
     nowhere = finder.find(strongest(query(scene, extractor), 0))
@@ -230,29 +237,28 @@ def test_the_finder_finds_the_box(scene, extractor):
     assert nowhere.references == len(scene.images)
 
 
-def test_a_query_of_one_keypoint_or_none_has_no_matches(scene, extractor):
+def test_a_query_of_one_keypoint_or_none_has_no_matches(make, scene, extractor):
     of = query(scene, extractor)
     for count in (0, 1):
         few = replace(strongest(of, count), image=None)
-        assert [len(found) for found in all_rounds(OnePose(scene), few, scene)] == [0]
+        assert [len(found) for found in all_rounds(make(scene), few, scene)] == [0]
 
 
-def test_a_map_of_one_image_is_enough(scene, extractor):
+def test_a_map_of_one_image_is_enough(make, scene, extractor):
     alone = keep_images(scene, [next(iter(scene.images))])
-    assert len(all_rounds(OnePose(alone), query(scene, extractor), alone)[-1]) > 0.5 * POINTS
+    assert len(all_rounds(make(alone), query(scene, extractor), alone)[-1]) > 0.5 * POINTS
 
 
-def test_what_a_camera_should_see_is_what_direct_matching_says(scene):
-    for a, b in zip(OnePose(scene).visible_points(VIEW), Direct(scene).visible_points(VIEW), strict=True):
+def test_visible_points_are_those_of_direct_matching(make, scene):
+    for a, b in zip(make(scene).visible_points(VIEW), Direct(scene).visible_points(VIEW), strict=True):
         assert np.array_equal(a, b)
 
 
-def test_features_of_another_kind_are_refused(exact):
-    with pytest.raises(MapError, match="--extractor superpoint"):
-        OnePose(exact)
+def test_features_of_another_kind_are_refused(make, exact):
+    with pytest.raises(MapError, match="with the extractor superpoint"):
+        make(exact)
 
 
-def test_weights_that_are_missing_are_named(scene, tmp_path, monkeypatch):
-    monkeypatch.setenv("SLIMSFM_WEIGHTS", str(tmp_path))
-    with pytest.raises(InputError, match=r"GATsSPG\.ckpt"):
-        OnePose(scene)
+def test_missing_weights_are_named(make, scene, tmp_path):
+    with use_runtime(Runtime(weights=tmp_path)), pytest.raises(InputError, match=r"GATsSPG\.ckpt"):
+        make(scene)

@@ -8,6 +8,7 @@ from detector_free import RADIUS, SphereMatcher, ring_of_cameras
 from scenes import camera
 from slimsfm.cli.output import quiet
 from slimsfm.errors import InputError
+from slimsfm.features.registry import EXTRACTORS, ExtractorEntry
 from slimsfm.geometry import Box, corner_error, reprojection_errors
 from slimsfm.localization.localizer import Localizer
 from slimsfm.localization.matching import ReferenceMatching
@@ -22,6 +23,7 @@ from slimsfm.methods.loftr.mapping import build_without_keypoints
 from slimsfm.methods.loftr.reference_matching import DetectorFreeMatching
 from slimsfm.pose import estimate_pose
 from slimsfm.synthetic.trajectory import look_at
+from slimsfm.weights import FOLDER
 
 POSES = [*ring_of_cameras(5), look_at(np.array([3.5, 2.5, 0.9]), np.zeros(3))]  # the last is the query's
 NAMES = [f"{number}.png" for number in range(5)]
@@ -52,6 +54,14 @@ def sphere(tmp_path_factory) -> Map:
     return Map(model=built.model, features=built.features, matches=built.matches, photos=small, info=info)
 
 
+class SphereExtractor(DetectorFree):
+    """Matches by the matcher that knows the sphere."""
+
+    @property
+    def matcher(self) -> SphereMatcher:
+        return matcher()
+
+
 def query(step=1):
     image = np.ascontiguousarray(matcher().photo(5)[::step, ::step])
     features = DetectorFree().extract(image)
@@ -65,7 +75,7 @@ def query(step=1):
 
 
 def test_it_matches_references_as_others_do(sphere):
-    matching = DetectorFreeMatching(sphere, matcher())
+    matching = DetectorFreeMatching(sphere, matcher)
     assert isinstance(matching, ReferenceMatching)
     descriptors, points = matching.target(2)
     assert np.array_equal(points, sphere.observations[NAMES[2]].points)
@@ -75,7 +85,7 @@ def test_it_matches_references_as_others_do(sphere):
 @pytest.mark.parametrize("step", [1, 2])
 def test_matches_are_where_the_points_are_seen(sphere, step):
     """Whether photo and query are as large as their cameras say or half as large."""
-    matching = DetectorFreeMatching(sphere, matcher())
+    matching = DetectorFreeMatching(sphere, matcher)
     found = matching.match(query(step), 1, None)
     assert len(found) > 20
     assert len(np.unique(found.points)) == len(found)
@@ -85,7 +95,7 @@ def test_matches_are_where_the_points_are_seen(sphere, step):
 
 
 def test_an_exact_scene_localizes(sphere):
-    matching = DetectorFreeMatching(sphere, matcher())
+    matching = DetectorFreeMatching(sphere, matcher)
     found = unite([matching.match(query(), row, None) for row in range(len(NAMES))])
     assert found.references == len(NAMES)
     pose = estimate_pose(found.pixels(query()), sphere.points3D_in_world[found.points], camera())
@@ -95,7 +105,7 @@ def test_an_exact_scene_localizes(sphere):
 
 def test_a_map_of_fewer_images_localizes_too(sphere):
     slim = keep_images(sphere, NAMES[1:3])
-    matching = DetectorFreeMatching(slim, matcher())
+    matching = DetectorFreeMatching(slim, matcher)
     found = unite([matching.match(query(), row, None) for row in range(2)])
     pose = estimate_pose(found.pixels(query()), slim.points3D_in_world[found.points], camera())
     assert pose is not None
@@ -104,14 +114,14 @@ def test_a_map_of_fewer_images_localizes_too(sphere):
 
 def test_a_view_of_nothing_in_common_gives_no_match(sphere):
     behind = SphereMatcher([*POSES[:5], look_at(np.array([-5.0, -3, 0]), np.zeros(3))], camera(), 16.0)
-    found = DetectorFreeMatching(sphere, behind).match(query(), 1, None)
+    found = DetectorFreeMatching(sphere, lambda: behind).match(query(), 1, None)
     assert len(found) == 0
     assert found.pixels(query()).shape == (0, 2)
 
 
-def test_a_query_is_described_cell_by_cell(sphere):
-    """The matcher of the tests tells where on the sphere a place is."""
-    described = DetectorFreeMatching(sphere, matcher()).describe(query())
+def test_a_query_is_described_per_cell(sphere):
+    """The matcher of the tests describes a pixel by its position on the sphere."""
+    described = DetectorFreeMatching(sphere, matcher).describe(query())
     assert described.shape == (40 * 30, 3)
     seen = described[described.any(axis=1)]
     towards = POSES[5].inverse().translation
@@ -119,11 +129,11 @@ def test_a_query_is_described_cell_by_cell(sphere):
     assert len(seen) > 100
 
 
-def test_what_is_missing_is_said(sphere):
-    with pytest.raises(InputError, match="--extractor loftr"):
-        DetectorFreeMatching(replace(sphere, photos={}), matcher())
+def test_missing_photos_and_images_are_errors(sphere):
+    with pytest.raises(InputError, match="with the extractor loftr"):
+        DetectorFreeMatching(replace(sphere, photos={}), matcher)
     with pytest.raises(InputError, match="image"):
-        DetectorFreeMatching(sphere, matcher()).match(replace(query(), image=None), 0, None)
+        DetectorFreeMatching(sphere, matcher).match(replace(query(), image=None), 0, None)
 
 
 @pytest.fixture
@@ -136,9 +146,9 @@ def folder(tmp_path):
 
 
 def test_from_photos_by_way_of_the_disk_to_a_pose(folder, tmp_path, monkeypatch):
-    for module in ("mapping.build", "localization.detector_free"):
-        monkeypatch.setattr(f"slimsfm.{module}.load_image_matcher", lambda _name, _options: matcher())
-    monkeypatch.delenv("SLIMSFM_WEIGHTS", raising=False)
+    entry = ExtractorEntry(path="methods.test_reference_matching:SphereExtractor", has_keypoints=False)
+    monkeypatch.setitem(EXTRACTORS, "loftr", entry)
+    monkeypatch.delenv(FOLDER, raising=False)
     made = camera()
     made.camera_id = 1
     known = KnownPoses(
