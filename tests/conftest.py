@@ -8,10 +8,18 @@ from threadpoolctl import threadpool_limits
 
 from scenes import exact_map, with_matches
 from slimsfm.mapping.map import Map
+from slimsfm.weights import chosen_runtime, use_runtime
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores: threads of each would collide
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
     threadpool_limits(1)
+
+
+@pytest.fixture(autouse=True)
+def restored_runtime() -> Iterator[None]:
+    """Undo what a command does that a test runs in this process: its runtime ends with the test."""
+    with use_runtime(chosen_runtime()):
+        yield
 
 
 @pytest.fixture(scope="session")
