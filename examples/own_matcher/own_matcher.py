@@ -12,12 +12,12 @@ class SoftmaxMatcher:
     """Matches by a dual softmax over cosines."""
 
     def __init__(self, features: str) -> None:
-        """Accept features of any extractor; a trained matcher would reject features it was not trained for."""
+        """Accept features of any extractor; a trained matcher would reject unknown ones."""
         if features == "loftr":
             raise ValueError("features must be of an extractor with keypoints; loftr finds none")
 
     def match(self, features1: Features, features2: Features) -> np.ndarray:
-        """Return pairs (row of features1, row of features2), sorted by the first; each row occurs at most once."""
+        """Return pairs (row of features1, row of features2), sorted by the first; each row at most once."""
         if not len(features1) or not len(features2):
             return np.zeros((0, 2), np.int64)
         cosines = unit_rows(features1.descriptors) @ unit_rows(features2.descriptors).T

@@ -128,7 +128,7 @@ def test_known_poses_and_cameras_stay_as_they_are(built):
 
 
 def test_features_tell_what_a_keypoint_shows(built):
-    """The matcher of the tests tells where on the sphere a place is."""
+    """The matcher of the tests describes a pixel by its position on the sphere."""
     for image in built.model.images.values():
         points = np.array([built.model.point3D(point.point3D_id).xyz for point in image.points2D])
         descriptors = built.features[image.name].descriptors
@@ -187,9 +187,9 @@ def test_depths_are_those_of_least_squares(built):
     tracks = replace(tracks, points2D=tracks.points2D + rng.normal(scale=1.0, size=tracks.points2D.shape))
     rays = rays_of(built.model, tracks, choose_references(tracks))
     start = rays.depths * rng.uniform(0.9, 1.1, len(rays.depths))
-    depths = refine_depths(rays.sightings, start)
+    depths = refine_depths(rays.observations, start)
     for point in range(20):
-        mine = rays.sightings[np.flatnonzero(rays.sightings.points == point)]
+        mine = rays.observations[np.flatnonzero(rays.observations.points == point)]
         mine = replace(mine, points=np.zeros(len(mine.points), np.int64))
         found = least_squares(
             lambda depth, mine=mine: mine.residuals(depth).ravel(), start[point : point + 1], xtol=1e-14
@@ -201,7 +201,7 @@ def test_depths_are_those_of_least_squares(built):
 def test_a_point_that_nothing_fixes_stays(built):
     tracks = read_tracks(built.model)
     rays = rays_of(built.model, tracks, choose_references(tracks))
-    nothing = rays.sightings[np.zeros(0, np.int64)]
+    nothing = rays.observations[np.zeros(0, np.int64)]
     assert np.array_equal(refine_depths(nothing, rays.depths), rays.depths)
 
 
@@ -234,7 +234,7 @@ def test_pairs_of_similar_images_cannot_be_asked_for():
 
 
 def test_it_runs_with_a_network(tmp_path):
-    """With made-up weights, over a plane of random squares: what is exact here are the cells."""
+    """With seeded weights and a plane of random squares, on which cells are exact."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("kornia")
     from networks.seeded import fill
