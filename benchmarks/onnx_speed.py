@@ -8,7 +8,6 @@ wall time and once as CPU time, which other programs disturb less.
 """
 
 import argparse
-import os
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter, process_time
@@ -19,9 +18,8 @@ import torch
 
 from random_weights import write_random_weights
 from slimsfm.features import Features, load_extractor, load_matcher, unit_rows
-from slimsfm.features.exporting import export_method
-from slimsfm.networks.devices import DEVICE
-from slimsfm.weights import FOLDER
+from slimsfm.features.registry import export_method
+from slimsfm.weights import Runtime, use_runtime
 
 EXTRACTORS = {
     "superpoint": ("superpoint", {}),
@@ -41,7 +39,6 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=10)
     arguments = parser.parse_args()
-    os.environ[DEVICE] = "cpu"
     torch.set_num_threads(arguments.threads)
     folders = prepare(arguments.output, arguments.weights)
     print(f"{arguments.threads} threads, {SIZE[0]} x {SIZE[1]} pixels; ms by the clock and of the processor")
@@ -69,7 +66,7 @@ def prepare(output: Path, weights: Path | None) -> tuple[Path, Path]:
         link = folders[1] / path.name
         link.unlink(missing_ok=True)
         link.symlink_to(path.resolve())
-    os.environ[FOLDER] = str(folders[0])
+    use_runtime(Runtime(weights=folders[0], device="cpu"))
     known = [method for method in EXTRACTORS if not method.startswith("aliked") or weights]
     for method in (*known, "lightglue-aliked"):
         start = perf_counter()
@@ -104,7 +101,7 @@ def compare(title: str, folders: tuple[Path, Path], ways: list[Callable], given:
     times = np.zeros((len(folders), repeats + 1, 2))
     for turn in range(repeats + 1):
         for way, folder in enumerate(folders):
-            os.environ[FOLDER] = str(folder)
+            use_runtime(Runtime(weights=folder, device="cpu"))
             start = perf_counter(), process_time()
             ways[way](*given)
             times[way, turn] = perf_counter() - start[0], process_time() - start[1]

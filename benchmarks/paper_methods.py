@@ -8,7 +8,6 @@ random weights only times are meaningful, and no accuracy is printed.
 """
 
 import argparse
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -27,18 +26,17 @@ from slimsfm.evaluation.protocol import PreparedQuery, evaluate, outcomes_of, pr
 from slimsfm.evaluation.results import Outcomes, join_outcomes
 from slimsfm.evaluation.scores import Scores, score
 from slimsfm.features import Features
-from slimsfm.features.image_matching import load_image_matcher
-from slimsfm.features.superpoint import SuperPoint
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.photo_file import shrink_photo
 from slimsfm.mapping.subset import keep_images
-from slimsfm.networks.superpoint import describe_pixels
+from slimsfm.methods.loftr.matcher import Loftr
+from slimsfm.methods.superpoint import SuperPoint, describe_pixels
 from slimsfm.photos import read_image
 from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
-from slimsfm.weights import FOLDER, WEIGHTS
+from slimsfm.weights import WEIGHTS, Runtime, use_runtime
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +118,7 @@ def _weights(folder: Path, given: Path | None) -> set[str]:
     found = {name for name, one in WEIGHTS.items() if given and (given / one.file).is_file()}
     for name in found:
         shutil.copy(given / WEIGHTS[name].file, folder)  # pyright: ignore[reportOptionalOperand]
-    os.environ[FOLDER] = str(folder)
+    use_runtime(Runtime(weights=folder))
     return found
 
 
@@ -158,7 +156,7 @@ def _by_superpoint() -> Describe:
 
 
 def _by_loftr() -> Describe:
-    matcher = load_image_matcher("loftr", {"weights": "loftr-onepose++"})
+    matcher = Loftr(weights="loftr-onepose++")
     return lambda photo, features: matcher.describe(
         matcher.encode(photo), features.keypoints.astype(np.float64)
     )

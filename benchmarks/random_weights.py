@@ -19,10 +19,10 @@ from transformers import (
     SuperPointForKeypointDetection,
 )
 
-from slimsfm.features import lightglue
-from slimsfm.networks.loftr import make_network
-from slimsfm.networks.onepose import GraphAttentionMatcher
-from slimsfm.networks.onepose_plus import OnePosePlusMatcher
+from slimsfm.methods.lightglue import KNOWN, network_for
+from slimsfm.methods.loftr.network import make_network
+from slimsfm.methods.onepose.network import GraphAttentionMatcher
+from slimsfm.methods.onepose_plus.network import OnePosePlusMatcher
 
 
 def write_random_weights(folder: Path, seed: int = 0) -> Path:
@@ -33,7 +33,7 @@ def write_random_weights(folder: Path, seed: int = 0) -> Path:
         "depth-save.pth": {"extractor": _state(DISK())},
         "superpoint_v1.pth": _state(SuperPointForKeypointDetection(SuperPointConfig())),
         "superglue_outdoor.pth": _state(superglue),
-        **{f"{name}_lightglue.pth": _state(lightglue.network_for(name)) for name in lightglue.KNOWN},
+        **{f"{name}_lightglue.pth": _state(network_for(name)) for name in KNOWN},
         "loftr_outdoor.ckpt": {"state_dict": _state(make_network(window=5, coarse_context=True), "matcher.")},
         "LoFTR_wsize9.ckpt": {"state_dict": _state(make_network(window=9, coarse_context=False), "matcher.")},
         "GATsSPG.ckpt": {"state_dict": _state(GraphAttentionMatcher(), "matcher.")},

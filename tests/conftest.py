@@ -3,15 +3,25 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
 from scenes import exact_map, with_matches
 from slimsfm.mapping.map import Map
+from slimsfm.weights import chosen_runtime, use_runtime
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores: threads of each would collide
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
     threadpool_limits(1)
+
+
+@pytest.fixture(autouse=True)
+def restored_runtime() -> Iterator[None]:
+    """Undo what a command does that a test runs in this process: its runtime ends with the test."""
+    with use_runtime(chosen_runtime()):
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -42,3 +52,14 @@ def scheduler() -> Iterator[str]:
         ) as cluster,
     ):
         yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="session")
+def textured() -> np.ndarray:
+    """Noise of several scales: blobs and corners of every size."""
+    rng = np.random.default_rng(0)
+    layers = [
+        cv2.GaussianBlur(rng.normal(size=(240, 320, 3)).astype(np.float32), None, sigma) * sigma
+        for sigma in (1.0, 2.0, 4.0, 8.0)
+    ]
+    return np.clip(128 + 90 * np.sum(layers, axis=0), 0, 255).astype(np.uint8)

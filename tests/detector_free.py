@@ -1,12 +1,12 @@
-"""A sphere, and a matcher that knows it: cells match by what they show, and places are aligned exactly."""
+"""A sphere and a matcher that knows it: cells match if they show the same, and alignment is exact."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
-from slimsfm.features.image_matching import ImageMatches
 from slimsfm.geometry import project
+from slimsfm.methods.loftr.image_matching import ImageMatches
 from slimsfm.synthetic.trajectory import look_at
 
 RADIUS = 1.0
@@ -24,7 +24,7 @@ def ring_of_cameras(count: int) -> list[pycolmap.Rigid3d]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """An encoded image: from where the sphere was seen."""
+    """An encoded image: the pose from which the sphere was seen."""
 
     cam_from_world: pycolmap.Rigid3d
     camera: pycolmap.Camera
@@ -32,7 +32,7 @@ class Seen:
     image_size: tuple[int, int]
 
     def surface(self, points2D: np.ndarray) -> np.ndarray:
-        """Points of the sphere that pixels show; NaN where they show none."""
+        """Points of the sphere at given pixels; NaN beyond the sphere."""
         on_plane = np.asarray(self.camera.cam_from_img(points2D)).reshape(-1, 2)
         ray = np.column_stack([on_plane, np.ones(len(points2D))])
         world_from_cam = self.cam_from_world.inverse()
@@ -49,20 +49,20 @@ class Seen:
         return np.sum(points * towards, axis=1) / (RADIUS * np.linalg.norm(towards, axis=1))
 
     def cell_of(self, points2D: np.ndarray) -> np.ndarray:
-        """The middle of the cell that pixels lie in."""
+        """Center of the cell of each pixel."""
         return (np.floor(points2D / self.cell_px) + 0.5) * self.cell_px
 
     @property
     def cells(self) -> np.ndarray:
-        """The middles of all cells."""
+        """Centers of all cells."""
         columns, rows = (np.arange(0.5, side // self.cell_px) for side in self.image_size)
         return self.cell_px * np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
 class SphereMatcher:
-    """Fulfils `ImageMatcher`. A photo of the sphere is an image whose gray tells the number of its pose.
+    """Implements `ImageMatcher`. The gray level of a photo encodes the number of its pose.
 
-    Places are aligned only if they are within `reach_px` of where they should be.
+    Pixels are aligned only within `reach_px` of the right position.
     """
 
     name = "loftr"
@@ -117,5 +117,5 @@ class SphereMatcher:
         return np.where(near[:, None], exact, points2D_2)
 
     def describe(self, one: Seen, points2D):
-        """Where on the sphere a place is."""
+        """Position of a pixel on the sphere."""
         return np.nan_to_num(one.surface(points2D)).astype(np.float16)

@@ -1,32 +1,44 @@
 import logging
+import pickle
+from pathlib import Path
 
 import pytest
 
 from slimsfm import weights
 from slimsfm.errors import InputError
-from slimsfm.weights import FOLDER, WEIGHTS, find_weights, remind_of_licence, weights_folder
+from slimsfm.execution import processes, run_tasks
+from slimsfm.weights import (
+    DEVICE,
+    FOLDER,
+    WEIGHTS,
+    Runtime,
+    current_runtime,
+    find_weights,
+    remind_of_license,
+    use_runtime,
+)
 
 
-def test_every_file_has_a_name_of_its_own_a_source_and_a_licence():
+def test_every_file_has_its_own_name_a_source_and_a_license():
     files = [one.file for one in WEIGHTS.values()]
     assert len(set(files)) == len(files)
-    assert all(one.source and one.licence for one in WEIGHTS.values())
+    assert all(one.source and one.license for one in WEIGHTS.values())
 
 
-def test_just_what_magic_leap_published_is_for_research_only():
+def test_only_the_weights_of_magic_leap_are_for_research_only():
     assert [name for name, one in WEIGHTS.items() if one.is_research_only] == ["superpoint", "superglue"]
 
 
-def test_without_a_folder_nothing_is_found_there(monkeypatch):
+def test_without_a_folder_nothing_is_found(monkeypatch):
     monkeypatch.delenv(FOLDER, raising=False)
-    assert weights_folder() is None
+    assert current_runtime().weights is None
     assert find_weights("disk") is None
 
 
-def test_a_folder_that_is_none_is_named(monkeypatch, tmp_path):
+def test_a_missing_folder_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv(FOLDER, str(tmp_path / "nowhere"))
     with pytest.raises(
-        InputError, match="nowhere: no such folder of weights; mend --weights or SLIMSFM_WEIGHTS"
+        InputError, match=r"nowhere: no such folder of weights; set the weights folder .*SLIMSFM_WEIGHTS\)"
     ):
         find_weights("disk")
 
@@ -38,25 +50,52 @@ def test_files_are_found_by_their_published_names(monkeypatch, tmp_path):
     assert find_weights("disk") == tmp_path / "depth-save.pth"
 
 
-def test_another_file_under_a_published_name_is_told_by_its_checksum(monkeypatch, tmp_path):
-    monkeypatch.setenv(FOLDER, str(tmp_path))
+def test_another_file_under_a_published_name_is_refused_by_its_checksum(tmp_path):
     (tmp_path / "aliked-n16.pth").write_bytes(b"something")
-    with pytest.raises(InputError, match=r"aliked-n16\.pth: not the weights that were published .* ALIKED"):
+    message = r"aliked-n16\.pth: not the published weights .* ALIKED"
+    with use_runtime(Runtime(weights=tmp_path)), pytest.raises(InputError, match=message):
         find_weights("aliked-n16")
 
 
+def test_a_runtime_takes_precedence_over_the_environment_until_its_block_ends(monkeypatch, tmp_path):
+    monkeypatch.delenv(FOLDER, raising=False)
+    monkeypatch.setenv(DEVICE, "cpu")
+    with use_runtime(Runtime(weights=tmp_path, device="cuda")):
+        assert current_runtime() == Runtime(weights=tmp_path, device="cuda")
+        with use_runtime(None):
+            assert current_runtime() == Runtime(device="cpu")
+        assert current_runtime().device == "cuda"
+    assert current_runtime() == Runtime(device="cpu")
+    assert Runtime.from_environment(tmp_path) == Runtime(weights=tmp_path, device="cpu")
+
+
+def weights_of_worker(_task: int) -> Path | None:
+    return current_runtime().weights
+
+
+def test_worker_processes_use_the_runtime_of_the_process_that_submits(monkeypatch, tmp_path):
+    monkeypatch.delenv(FOLDER, raising=False)
+    with use_runtime(Runtime(weights=tmp_path, device="cpu")):
+        assert pickle.loads(pickle.dumps(current_runtime())) == current_runtime()
+        assert list(run_tasks(weights_of_worker, [1], lambda: processes(1))) == [(0, tmp_path)]
+    assert list(run_tasks(weights_of_worker, [1], lambda: processes(1))) == [(0, None)]
+
+
 def test_research_only_weights_say_so_once(caplog):
-    remind_of_licence.cache_clear()
+    remind_of_license.cache_clear()
     with caplog.at_level(logging.WARNING, logger="slimsfm"):
         for name in ("superpoint", "superpoint", "disk"):
-            remind_of_licence(name)
+            remind_of_license(name)
     assert [record.getMessage() for record in caplog.records] == [
-        "superpoint_v1.pth: its licence (Magic Leap) allows research only, no commercial use"
+        "superpoint_v1.pth: the license (Magic Leap) allows research only, no commercial use"
     ]
 
 
-def test_what_is_missing_says_which_file_from_where_and_what_to_do():
-    assert str(weights.missing(WEIGHTS["onepose"])) == (
-        "weights GATsSPG.ckpt are missing; get them from the OnePose repository of zju3dv, whose README "
-        "links it, put them into a folder and name it by --weights or SLIMSFM_WEIGHTS"
+def test_missing_weights_name_the_file_its_source_its_license_and_where_to_put_it():
+    assert str(weights.missing(WEIGHTS["aliked-n16"])) == (
+        "the weights aliked-n16.pth are missing and could not be downloaded; get them from the ALIKED "
+        "repository of Shiaoming (https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16.pth), "
+        "license BSD-3-Clause, put the file into a folder, and set the weights folder to it (environment "
+        "variable SLIMSFM_WEIGHTS)"
     )
+    assert "GATsSPG.ckpt are missing" in str(weights.missing(WEIGHTS["onepose"]))

@@ -1,23 +1,23 @@
-"""A matcher of one's own: two features match where each would most probably choose the other."""
+"""A custom matcher: two features match if each would most likely choose the other."""
 
 import numpy as np
 
 from slimsfm.features import Features, unit_rows
 
-TEMPERATURE = 0.02  # the smaller, the surer must the nearest be
-THRESHOLD = 0.2  # least product of both probabilities
+TEMPERATURE = 0.02  # smaller values favor the nearest neighbor more strongly
+THRESHOLD = 0.2  # least product of the two probabilities
 
 
 class SoftmaxMatcher:
-    """Matches by dual softmax over cosines."""
+    """Matches by a dual softmax over cosines."""
 
     def __init__(self, features: str) -> None:
-        """Of features of any extractor; a trained matcher would refuse those that it was not trained for."""
+        """Accept features of any extractor; a trained matcher would reject unknown ones."""
         if features == "loftr":
-            raise ValueError("features must be of an extractor, and loftr finds none")
+            raise ValueError("features must be of an extractor with keypoints; loftr finds none")
 
     def match(self, features1: Features, features2: Features) -> np.ndarray:
-        """Pairs (row of features1, row of features2), sorted by the first; no row occurs twice."""
+        """Return pairs (row of features1, row of features2), sorted by the first; each row at most once."""
         if not len(features1) or not len(features2):
             return np.zeros((0, 2), np.int64)
         cosines = unit_rows(features1.descriptors) @ unit_rows(features2.descriptors).T

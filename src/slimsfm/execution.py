@@ -15,7 +15,8 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     as_completed,
 )
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
 from multiprocessing import get_context
 from os import sched_getaffinity
 from typing import TypeVar
@@ -23,6 +24,7 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from slimsfm.errors import WorkError
+from slimsfm.weights import Runtime, chosen_runtime, use_runtime
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -122,6 +124,7 @@ def run_tasks(
         for index, task in enumerate(tasks):
             yield index, function(task)
         return
+    function = partial(_with_runtime, chosen_runtime(), function)
     pending = dict(enumerate(tasks))
     failures: Counter[int] = Counter()
     while pending:
@@ -131,6 +134,12 @@ def run_tasks(
         if broke and len(pending) == before:
             failures.update(pending.keys())
         _check(failures)
+
+
+def _with_runtime(runtime: Runtime | None, function: Callable[[Task], Result], task: Task) -> Result:
+    """Run a task on a worker with the runtime of the process that submits it."""
+    with use_runtime(runtime) if runtime else nullcontext():
+        return function(task)
 
 
 def _one_round(

@@ -8,7 +8,7 @@ from transformers import SuperPointConfig, SuperPointForKeypointDetection  # noq
 
 from commands import contents, slimsfm  # noqa: E402
 from networks.seeded import fill  # noqa: E402
-from slimsfm.features.exporting import EXPORTABLE  # noqa: E402
+from slimsfm.features.registry import EXPORTABLE  # noqa: E402
 from slimsfm.weights import FOLDER, WEIGHTS  # noqa: E402
 
 

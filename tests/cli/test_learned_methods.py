@@ -101,5 +101,9 @@ def test_missing_weights_are_named_before_anything_is_written(boulder, tmp_path,
         "build", boulder.photos, "-o", tmp_path / "map", "--extractor", "superpoint", "--weights", tmp_path
     )
     assert found.code == 2
-    assert "weights superpoint_v1.pth are missing; get them from the SuperGluePretrainedNetwork" in found.err
+    assert (
+        "weights superpoint_v1.pth are missing and could not be downloaded; get them from the SuperGlue"
+        in found.err
+    )
+    assert "license Magic Leap: research only, put the file into a folder" in found.err
     assert not (tmp_path / "map").exists()

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from slimsfm.cli.output import quiet
-from slimsfm.features.methods import plugins
+from slimsfm.features.registry import plugins
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.hloc import write_hloc
 from slimsfm.mapping.io import write_map

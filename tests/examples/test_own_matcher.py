@@ -7,7 +7,7 @@ import pytest
 
 from commands import slimsfm
 from slimsfm.features import load_matcher, match_nearest, unit_rows
-from slimsfm.features.methods import plugins
+from slimsfm.features.registry import plugins
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
 

@@ -11,7 +11,7 @@ def random_units(rng, count, dimension):
 
 
 def by_definition(a, b, options):
-    """Mutual nearest neighbours that pass the ratio and the distance test, one by one."""
+    """Mutual nearest neighbors that pass the ratio and the distance test, one by one."""
     angles = np.arccos(np.clip(a @ b.T, -1, 1))
     pairs = []
     for i, row in enumerate(angles):

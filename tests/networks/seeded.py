@@ -1,4 +1,4 @@
-"""Weights that anybody can make again: golden numbers need no file of weights beside them."""
+"""Reproducible weights, so that golden numbers do not need weight files."""
 
 import numpy as np
 import torch

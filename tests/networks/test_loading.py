@@ -7,17 +7,16 @@ torch = pytest.importorskip("torch")
 from torch import nn  # noqa: E402
 
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.networks import loading  # noqa: E402
-from slimsfm.networks.devices import DEVICE, choose_device  # noqa: E402
+from slimsfm.networks.devices import choose_device  # noqa: E402
 from slimsfm.networks.loading import load_network, load_state  # noqa: E402
-from slimsfm.weights import FOLDER  # noqa: E402
+from slimsfm.weights import DEVICE, FOLDER, Runtime, use_runtime  # noqa: E402
 
 
 class Explosive:
-    """Does harm when it is unpickled."""
+    """Fails the test when it is unpickled."""
 
     def __reduce__(self):
-        return (pytest.fail, ("code in a file of weights was run",))
+        return (pytest.fail, ("code in a weight file was run",))
 
 
 def network(width: int = 3) -> nn.Module:
@@ -62,7 +61,7 @@ def test_checkpoints_of_training_frameworks_are_read_without_running_their_code(
     ],
     ids=["missing", "shape", "surplus"],
 )
-def test_weights_of_another_network_are_told_and_never_half_loaded(tmp_path, state, message):
+def test_weights_of_another_network_are_refused_and_never_half_loaded(tmp_path, state, message):
     untouched = network()
     before = values_of(untouched)
     torch.save(state, tmp_path / "w.pth")
@@ -71,7 +70,7 @@ def test_weights_of_another_network_are_told_and_never_half_loaded(tmp_path, sta
     assert equal(before, values_of(untouched))
 
 
-def test_a_layout_that_nobody_knows_is_told(tmp_path):
+def test_an_unknown_layout_is_refused(tmp_path):
     torch.save(network().state_dict(), tmp_path / "w.pth")
     with pytest.raises(InputError, match=r"w\.pth: these are not the weights of Linear"):
         load_state(network(), tmp_path / "w.pth", lambda held: dict(held["state_dict"]))
@@ -79,7 +78,7 @@ def test_a_layout_that_nobody_knows_is_told(tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"not a file of weights", pickle.dumps(Explosive())])
 @pytest.mark.parametrize("name", ["w.pth", "w.safetensors"])
-def test_damaged_files_are_told(tmp_path, content, name):
+def test_damaged_files_are_refused(tmp_path, content, name):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=name):
         load_state(network(), tmp_path / name)
@@ -92,30 +91,47 @@ def test_values_that_a_network_derives_may_be_missing(tmp_path):
     assert torch.equal(made.state_dict()["weight"], torch.ones(2, 3))
 
 
-def test_missing_weights_are_named_where_there_is_no_network(monkeypatch, tmp_path):
-    monkeypatch.setenv(FOLDER, str(tmp_path))
-    monkeypatch.setattr(loading, "_from_hugging_face", lambda _address: None)
-    with pytest.raises(InputError, match=r"weights depth-save\.pth are missing; get them from the DISK"):
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    """An empty cache of Hugging Face, and no network."""
+    hub, constants = (pytest.importorskip(f"huggingface_hub{part}") for part in ("", ".constants"))
+    for name in ("http_proxy", "https_proxy", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.upper(), raising=False)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(constants, "ENDPOINT", "https://nowhere.invalid")
+    return hub
+
+
+@pytest.mark.usefixtures("hub")
+def test_missing_weights_are_named_without_a_network(tmp_path):
+    message = r"weights depth-save\.pth are missing .*; get them from the DISK repository of cvlab-epfl"
+    with use_runtime(Runtime(weights=tmp_path)), pytest.raises(InputError, match=message):
         load_network(network(), "disk")
 
 
-def test_what_the_hub_gives_is_loaded(monkeypatch, tmp_path):
+def test_weights_in_the_cache_of_the_hub_are_loaded(hub, monkeypatch, tmp_path):
     monkeypatch.delenv(FOLDER, raising=False)
     saved = network()
     torch.save(saved.state_dict(), tmp_path / "depth-save.pth")
-    monkeypatch.setattr(loading, "_from_hugging_face", lambda _address: tmp_path / "depth-save.pth")
+    monkeypatch.setattr(hub, "try_to_load_from_cache", lambda *_: str(tmp_path / "depth-save.pth"))
     assert equal(values_of(load_network(network(), "disk")), values_of(saved))
 
 
-def test_the_device_is_as_wished(monkeypatch):
+def test_the_device_is_the_runtimes_or_the_users_default(monkeypatch):
     monkeypatch.setenv(DEVICE, "cpu")
     assert choose_device().type == "cpu"
     monkeypatch.setenv(DEVICE, "abacus")
     with pytest.raises(InputError, match="device must be auto, cpu or cuda, got 'abacus'"):
         choose_device()
+    with use_runtime(Runtime(device="cpu")):
+        assert choose_device().type == "cpu"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_told():
-    with pytest.raises(InputError, match="torch sees no GPU here; use --device cpu"):
-        choose_device("cuda")
+def test_a_missing_gpu_is_an_error():
+    with (
+        use_runtime(Runtime(device="cuda")),
+        pytest.raises(InputError, match="torch finds no GPU; set the device to cpu"),
+    ):
+        choose_device()

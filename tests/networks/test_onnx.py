@@ -1,5 +1,7 @@
-"""What runs by onnxruntime is what runs by PyTorch."""
+"""onnxruntime computes what PyTorch computes."""
 
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,24 +20,22 @@ from transformers import SuperPointConfig, SuperPointForKeypointDetection  # noq
 
 from networks.seeded import fill  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.features import Features, lightglue, load_extractor, unit_rows  # noqa: E402
-from slimsfm.features.exporting import export_method  # noqa: E402
-from slimsfm.features.superpoint import SuperPoint  # noqa: E402
-from slimsfm.networks import onnx  # noqa: E402
-from slimsfm.networks.aliked import AlikedMaps, Deformable, dense_maps  # noqa: E402
-from slimsfm.networks.devices import DEVICE  # noqa: E402
+from slimsfm.features import Features, load_extractor, unit_rows  # noqa: E402
+from slimsfm.features.registry import export_method  # noqa: E402
+from slimsfm.methods.aliked import AlikedMaps, Deformable, dense_maps  # noqa: E402
+from slimsfm.methods.lightglue import LightGlue, Network, network_for  # noqa: E402
+from slimsfm.methods.superpoint import SuperPoint  # noqa: E402
 from slimsfm.networks.onnx import Exportable, onnx_run, write_onnx  # noqa: E402
-from slimsfm.weights import FOLDER  # noqa: E402
+from slimsfm.weights import Runtime, use_runtime  # noqa: E402
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder of weights, where networks run on the CPU."""
-    monkeypatch.setenv(FOLDER, str(tmp_path))
-    monkeypatch.setenv(DEVICE, "cpu")
-    return tmp_path
+def folder(tmp_path):
+    """The weights folder; networks run on the CPU."""
+    with use_runtime(Runtime(weights=tmp_path, device="cpu")):
+        yield tmp_path
 
 
 def picture(height: int, width: int) -> np.ndarray:
@@ -53,7 +53,7 @@ def part(network: nn.Module, *shape: int, free: tuple[int, ...] = ()) -> Exporta
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory) -> Path:
-    """A network of one layer that says that it is DISK's."""
+    """A network of one layer in a file that claims to be DISK."""
     path = tmp_path_factory.mktemp("tiny") / "disk.onnx"
     network = nn.Conv2d(2, 3, 3)
     fill(network, 0)
@@ -72,47 +72,47 @@ def test_inputs_of_any_size_give_what_pytorch_gives(tiny, folder):
         assert torch.allclose(found, network(tensor(1, 2, *size)), atol=1e-6)
 
 
-def test_the_file_tells_nothing_of_where_it_was_made(tiny):
+def test_the_file_does_not_contain_local_paths(tiny):
     assert str(Path.home()).encode() not in tiny.read_bytes()
     assert b"site-packages" not in tiny.read_bytes()
 
 
-def test_without_a_file_or_a_cpu_pytorch_runs(tiny, folder, monkeypatch):
+def test_pytorch_runs_without_a_file_and_on_a_gpu(tiny, folder, monkeypatch):
     assert onnx_run("disk") is None
     (folder / "disk.onnx").write_bytes(tiny.read_bytes())
     assert onnx_run("disk") is onnx_run("disk") is not None
-    monkeypatch.setattr(onnx, "choose_device", lambda: torch.device("cuda"))
-    assert onnx_run("disk") is None
-    monkeypatch.delenv(FOLDER)
-    assert onnx_run("disk") is None
+    with use_runtime(Runtime(device="cpu")):
+        assert onnx_run("disk") is None
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with use_runtime(Runtime(weights=folder, device="cuda")):
+        assert onnx_run("disk") is None
 
 
-def test_files_that_are_not_the_methods_own_are_told(tiny, folder):
+def test_files_of_other_methods_are_refused(tiny, folder):
     (folder / "superpoint.onnx").write_bytes(tiny.read_bytes())
-    with pytest.raises(InputError, match=r"superpoint\.onnx: was not made by slimsfm export onnx superpoint"):
+    with pytest.raises(
+        InputError, match=r"superpoint\.onnx: was not written by slimsfm export onnx superpoint"
+    ):
         onnx_run("superpoint")
     (folder / "superpoint.onnx").write_bytes(b"something")
-    with pytest.raises(InputError, match=r"superpoint\.onnx: onnxruntime cannot read it .* make it anew by"):
+    with pytest.raises(InputError, match=r"superpoint\.onnx: onnxruntime cannot read it .* export it again"):
         onnx_run("superpoint")
 
 
-def test_a_file_made_of_other_weights_is_told(folder):
+def test_a_file_with_other_weights_is_refused(folder):
     (folder / "depth-save.pth").write_bytes(b"some weights")
     write_onnx(part(nn.Identity(), 1, 2), "disk", folder / "disk.onnx")
     assert onnx_run("disk") is not None
-    onnx._load.cache_clear()
+    os.utime(folder / "disk.onnx", ns=(1, 1))  # so that the file is loaded again
     (folder / "depth-save.pth").write_bytes(b"other weights")
-    with pytest.raises(InputError, match=r"disk\.onnx: was made of other weights than depth-save\.pth"):
+    with pytest.raises(InputError, match=r"disk\.onnx: was exported from other weights than depth-save\.pth"):
         onnx_run("disk")
 
 
 def test_a_missing_package_is_named(tiny, folder, monkeypatch):
-    def missing(name):
-        raise ModuleNotFoundError(name=name)
-
     (folder / "disk.onnx").write_bytes(tiny.read_bytes())
-    onnx._load.cache_clear()
-    monkeypatch.setattr(onnx, "import_module", missing)
+    for package in ("onnx", "onnxruntime"):
+        monkeypatch.setitem(sys.modules, package, None)
     message = r"ONNX files need {}, which is not installed: pip install 'slimsfm\[onnx\]'"
     with pytest.raises(InputError, match=message.format("onnxruntime")):
         onnx_run("disk")
@@ -122,7 +122,7 @@ def test_a_missing_package_is_named(tiny, folder, monkeypatch):
 
 @pytest.fixture
 def superpoint(folder) -> SuperPointForKeypointDetection:
-    """Made-up weights that find keypoints; their file is in the folder."""
+    """Seeded weights that find keypoints, stored in the folder."""
     network = SuperPointForKeypointDetection(SuperPointConfig(keypoint_threshold=0.02)).eval()
     fill(network, 0)
     torch.save(network.state_dict(), folder / "superpoint_v1.pth")
@@ -138,7 +138,7 @@ def test_superpoint_finds_what_the_library_finds(superpoint):
     with torch.inference_mode():
         found = superpoint(gray.expand(1, 3, -1, -1))
     pixels = found.keypoints[0].numpy() * (131, 90)
-    inside = (pixels < np.array([131, 90]) // 8 * 8 - 4).all(axis=1)  # the library forgets these two sides
+    inside = (pixels < np.array([131, 90]) // 8 * 8 - 4).all(axis=1)  # transformers forgets these two sides
     order = np.argsort(-found.scores[0].numpy(), kind="stable")
     order = order[inside[order]]
     keypoints = pixels[order] + 0.5
@@ -152,7 +152,7 @@ def test_superpoint_finds_by_onnx_what_it_finds_by_pytorch(superpoint, folder): 
     export_method("superpoint", folder / "superpoint.onnx")
     (folder / "superpoint_v1.pth").unlink()
     assert_equal(SuperPoint(threshold=0.02).extract(image), by_torch)
-    (folder / "superpoint.onnx").write_bytes(b"looked at")
+    (folder / "superpoint.onnx").write_bytes(b"damaged")
     with pytest.raises(InputError):
         extractor.extract(image)
 
@@ -167,15 +167,9 @@ def assert_equal(one: Features, other: Features) -> None:
 
 @pytest.fixture
 def one_layer(folder, monkeypatch):
-    """LightGlue with made-up weights, shallow since all layers are alike, that matches what is alike."""
-    plain = lightglue.network_for
-
-    def shallow(features):
-        monkeypatch.setitem(lightglue.Network.default_conf, "n_layers", 1)
-        return plain(features)
-
-    monkeypatch.setattr(lightglue, "network_for", shallow)
-    network = shallow("sift")
+    """LightGlue with seeded weights, a single layer because all are alike, that matches similar features."""
+    monkeypatch.setitem(Network.default_conf, "n_layers", 1)
+    network = network_for("sift")
     fill(network, 0)
     with torch.no_grad():
         network.get_parameter("input_proj.weight").mul_(4)
@@ -197,24 +191,36 @@ def described(rng, count) -> Features:
     )
 
 
+def of_kornia(features: Features) -> dict[str, Tensor]:
+    """The input that kornia's LightGlue takes."""
+    given = {
+        "keypoints": features.keypoints - np.float32(0.5),
+        "descriptors": unit_rows(features.descriptors),
+        "image_size": np.array(features.image_size, np.float32),
+        "scales": features.frames[:, 0],
+        "oris": features.frames[:, 1],
+    }
+    return {key: torch.from_numpy(np.ascontiguousarray(value))[None] for key, value in given.items()}
+
+
 def test_lightglue_matches_by_onnx_what_it_matches_by_pytorch(one_layer, folder):
     rng = np.random.default_rng(0)
     one = described(rng, 60)
     order = rng.permutation(60)[:45]
     other, alone = one[order], one[order[:1]]
-    matcher = lightglue.LightGlue("sift")
+    matcher = LightGlue("sift")
     matcher.network.conf.width_confidence = matcher.network.conf.depth_confidence = -1
     by_torch = matcher.match(one, other)
     assert len(by_torch) > 30
     assert np.mean(order[by_torch[:, 1]] == by_torch[:, 0]) > 0.9
     with torch.inference_mode():
-        inputs = {f"image{i}": matcher._input(f, torch.device("cpu")) for i, f in enumerate((one, other))}
+        inputs = {f"image{i}": of_kornia(features) for i, features in enumerate((one, other))}
         one_layer.conf.width_confidence = one_layer.conf.depth_confidence = -1
         of_library = one_layer(inputs)["matches"][0].numpy()
     assert np.array_equal(by_torch, of_library)
     export_method("lightglue-sift", folder / "lightglue-sift.onnx")
-    assert np.array_equal(lightglue.LightGlue("sift").match(one, other), by_torch)
-    assert lightglue.LightGlue("sift").match(alone, other).tolist() == [[0, 0]]
+    assert np.array_equal(LightGlue("sift").match(one, other), by_torch)
+    assert LightGlue("sift").match(alone, other).tolist() == [[0, 0]]
 
 
 def test_deformable_convolution_is_the_librarys_by_pytorch_and_onnx(folder):
@@ -247,11 +253,10 @@ def test_aliked_sees_what_the_library_sees(model, size):
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs the trained ALIKED weights in ../shared/weights")
-def test_aliked_finds_what_the_library_finds(monkeypatch):
-    monkeypatch.setenv(FOLDER, str(SHARED))
-    monkeypatch.setenv(DEVICE, "cpu")
+def test_aliked_finds_what_the_library_finds():
     image = picture(150, 210)
-    features = load_extractor("aliked").extract(image)
+    with use_runtime(Runtime(weights=SHARED, device="cpu")):
+        features = load_extractor("aliked").extract(image)
     network = ALIKED("aliked-n16", 2048, 0.2).eval()
     state = torch.load(SHARED / "aliked-n16.pth", weights_only=True)
     network.load_state_dict(state | {"dkd.hw_grid": network.dkd.hw_grid})

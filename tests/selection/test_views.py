@@ -86,3 +86,19 @@ def test_points_that_only_one_image_observes_are_not_usable():
     first = next(iter(map_.images))
     alone = keep_images(map_, [first])
     assert selection_problem(alone, LeftOut(alone)).usable.nnz == 0
+
+
+def test_matches_are_judged_by_the_metric_of_the_maps_extractor():
+    """Right matches about 0.8 radians apart are found with ALIKED's thresholds, not with SIFT's."""
+    map_, rng = exact_map(num_images=8, num_points=80, reach_deg=80), np.random.default_rng(0)
+    features = {
+        name: replace(one, descriptors=unit_rows(one.descriptors + 5 * noise(rng, one.descriptors.shape)))
+        for name, one in map_.features.items()
+    }
+    usable = {}
+    for extractor in ("sift", "aliked"):
+        scattered = replace(map_, features=features, info=replace(map_.info, extractor=extractor))
+        usable[extractor] = selection_problem(scattered, LeftOut(scattered)).usable.nnz
+    seen = observed(map_).nnz
+    assert usable["sift"] < 0.3 * seen
+    assert usable["aliked"] > 0.6 * seen

@@ -19,7 +19,7 @@ from slimsfm.cli.output import (
     size,
 )
 from slimsfm.errors import InputError, OutputError
-from slimsfm.features.exporting import EXPORTABLE, export_method
+from slimsfm.features.registry import EXPORTABLE, export_method
 from slimsfm.files import check_writable
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.io import read_map

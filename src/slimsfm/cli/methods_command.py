@@ -10,7 +10,7 @@ from rich.table import Table
 from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, console, parse
 from slimsfm.errors import InputError
-from slimsfm.features.methods import plugins
+from slimsfm.features.registry import plugins
 from slimsfm.weights import WEIGHTS, find_weights
 
 
@@ -97,7 +97,7 @@ def methods(networks: Annotated[Networks, Flat] = Networks()) -> None:
         for row, name in enumerate(method.weights):
             weights = WEIGHTS[name]
             first = code if row == 0 else ("", "", "", "")
-            table.add_row(*first, weights.file, weights.licence, _found(method, name))
+            table.add_row(*first, weights.file, weights.license, _found(method, name))
     for kind in ("extractor", "matcher", "strategy"):
         for name, path in sorted(plugins(kind).items()):
             table.add_row(kind, name, path, "its own", "", "", "plug-in")

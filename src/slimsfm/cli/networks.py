@@ -1,11 +1,10 @@
 """Where networks run and where their weights are, as options of a command."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from slimsfm.weights import DEVICE, FOLDER, weights_folder
+from slimsfm.weights import Runtime, use_runtime
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,13 +18,9 @@ class Networks:
     """Where networks run; auto: on a GPU if there is one. Else as SLIMSFM_DEVICE says."""
 
     def apply(self) -> None:
-        """Make these hold for this process and those that it starts.
+        """Use these for all networks of the command, including those in its worker processes.
 
         Raises:
-            InputError: There is no such folder.
+            InputError: The folder does not exist.
         """
-        if self.weights is not None:
-            os.environ[FOLDER] = str(self.weights)
-        if self.device is not None:
-            os.environ[DEVICE] = self.device
-        weights_folder()
+        use_runtime(Runtime.from_environment(self.weights, self.device))

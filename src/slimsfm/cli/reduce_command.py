@@ -13,7 +13,6 @@ from slimsfm.cli.image_choice import ByImages
 from slimsfm.cli.limits import Limits
 from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
 from slimsfm.errors import InputError
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.mapping.subset import with_points
@@ -88,7 +87,7 @@ def reduce(
     check_has_features(full)
     if len(full.images) < 2:
         raise InputError(f"{map}: has one image; there is nothing to reduce")
-    if full.info.extractor in DETECTOR_FREE and not choosing.by.is_wanted:  # there are no points to match
+    if not full.has_keypoints and not choosing.by.is_wanted:  # there are no points to match
         choosing = replace(choosing, by=replace(choosing.by, solver="exact"))
     chosen = _chosen(full, map, choosing, execution)
     slim = _slim(full, chosen)

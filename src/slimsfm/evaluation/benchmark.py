@@ -9,11 +9,12 @@ from slimsfm.datasets.base import LoadOptions, ObjectSequences, map_object
 from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries, queries_of
 from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, map_path
 from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
-from slimsfm.features.methods import DETECTOR_FREE, EXTRACTORS, MATCHERS, plugins
+from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.graph.source import Edges
 from slimsfm.localization import LocalizationOptions
+from slimsfm.localization.localizer import supports
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
@@ -237,7 +238,7 @@ def _measurements(
 ) -> Iterator[Measurement]:
     for strategy in task.setup.options.strategies:
         for variant, maps in stored.items():
-            if maps and _is_possible(strategy, maps[0].map):
+            if maps and supports(strategy, maps[0].map):
                 runs = tuple(_map_run(task, one, strategy, queries) for one in maps)
                 yield Measurement(method=str(task.method), strategy=strategy, variant=variant, map_runs=runs)
 
@@ -252,9 +253,3 @@ def _map_run(
         map_bytes=stored.bytes,
         outcomes=evaluate(stored.map, queries, strategy, matcher, progress, task.sequences.model),
     )
-
-
-def _is_possible(strategy: str, map: Map) -> bool:
-    if strategy == "direct":
-        return map.info.extractor not in DETECTOR_FREE
-    return not map.is_for_direct_matching

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from slimsfm.domination import Solution
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
@@ -172,7 +171,7 @@ def _random(inputs: VariantInputs, count: int | None) -> list[Map]:
 
 
 def _default(inputs: VariantInputs, _: None) -> list[Map]:
-    if inputs.map.info.extractor in DETECTOR_FREE:
+    if not inputs.map.has_keypoints:
         return []
     options = FrontierOptions(uses=("direct",))
     found = frontier(inputs.map, None, inputs.weigh, options, inputs.progress)
@@ -188,7 +187,7 @@ def _points_settings(words: list[str]) -> tuple[int, str]:
 
 
 def _points(inputs: VariantInputs, settings: tuple[int, str]) -> list[Map]:
-    if inputs.map.info.extractor in DETECTOR_FREE:
+    if not inputs.map.has_keypoints:
         return []
     count, selector = settings
     problem = selection_problem(inputs.map, LeftOut(inputs.map), inputs.progress)

@@ -1,8 +1,8 @@
-"""Local features: what extractors and matchers give, and which there are."""
+"""Local features: data types, extractors, matchers and descriptor matching."""
 
-from slimsfm.features.base import Extractor, Features, Matcher, image_colors, unit_rows
-from slimsfm.features.methods import EXTRACTORS, MATCHERS, load_extractor, load_matcher
-from slimsfm.features.nearest import NearestOptions, match_nearest, nearest_for
+from slimsfm.features.base import Extractor, Features, Matcher, NearestOptions, image_colors, unit_rows
+from slimsfm.features.nearest import match_nearest
+from slimsfm.features.registry import EXTRACTORS, MATCHERS, load_extractor, load_matcher
 
 __all__ = [
     "EXTRACTORS",
@@ -15,6 +15,5 @@ __all__ = [
     "load_extractor",
     "load_matcher",
     "match_nearest",
-    "nearest_for",
     "unit_rows",
 ]

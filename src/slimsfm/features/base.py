@@ -1,4 +1,4 @@
-"""What every extractor and every matcher takes and gives."""
+"""Local features, and the protocols of extractors and matchers."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -9,30 +9,47 @@ from jaxtyping import Float32, Int64, Shaped, UInt8
 from slimsfm.arrays import Descriptors, GrayImage, Image, IndexPairs
 
 
+@dataclass(frozen=True, kw_only=True)
+class NearestOptions:
+    """How descriptors compare: which nearest neighbors count as matches."""
+
+    max_ratio: float = 0.8
+    """Largest distance to the nearest neighbor, relative to the distance to the second nearest."""
+
+    max_distance: float = 0.7
+    """Largest angle in radians between two matched descriptors."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_ratio <= 1:
+            raise ValueError(f"max_ratio must be in (0, 1], got {self.max_ratio}")
+        if not self.max_distance > 0:
+            raise ValueError(f"max_distance must be positive, got {self.max_distance}")
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
     """The local features of one image; row i of each array describes keypoint i."""
 
     keypoints: Float32[np.ndarray, "n 2"]
-    """Pixels, COLMAP's convention: the centre of the top-left pixel is (0.5, 0.5)."""
+    """Pixels, COLMAP's convention: the center of the top-left pixel is (0.5, 0.5)."""
 
     descriptors: Shaped[np.ndarray, "n d"]
     """As the extractor stores them (bytes or floats); `unit_rows` makes them comparable."""
 
     scores: Float32[np.ndarray, " n"]
-    """How sure the detector is of each keypoint; larger is surer."""
+    """Confidence of the detector in each keypoint; larger is better."""
 
     image_size: tuple[int, int]
     """Width and height of the upright image in pixels."""
 
     frames: Float32[np.ndarray, "n 2"] | None = None
-    """Scale in pixels and orientation in radians of each keypoint; None where the detector tells neither."""
+    """Scale in pixels and orientation in radians of each keypoint; None if the detector estimates neither."""
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
     def __getitem__(self, rows: Int64[np.ndarray, " k"]) -> "Features":
-        """The features of these rows, in this order."""
+        """Select features by row, in the given order."""
         return Features(
             keypoints=self.keypoints[rows],
             descriptors=self.descriptors[rows],
@@ -44,20 +61,27 @@ class Features:
 
 @runtime_checkable
 class Extractor(Protocol):
-    """Finds and describes keypoints. Equal images give equal features."""
+    """Finds and describes keypoints. Equal images give equal features.
+
+    The class of a plug-in may also have the attributes `descriptor_metric`, a `NearestOptions`, and
+    `has_keypoints`.
+    """
 
     @property
     def name(self) -> str:
-        """The name under which a map remembers its extractor."""
+        """Name of the extractor in a map's `map.json`."""
         ...
 
     @property
     def options(self) -> dict:
-        """What `load_extractor` needs to make an equal extractor."""
+        """Options with which `load_extractor` creates an equal extractor."""
         ...
 
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
-        """Find features, none where the mask, of the image's size, is 0. There may be no feature at all."""
+        """Extract features; the mask has the size of the image, and no feature lies where it is 0.
+
+        The result may be empty.
+        """
         ...
 
 
@@ -65,25 +89,17 @@ class Extractor(Protocol):
 class Matcher(Protocol):
     """Matches the features of two images. Equal features give equal matches.
 
-    It is made with one argument, `features`: the name of the extractor whose features it matches.
+    The class takes one argument, `features`: the name of the extractor whose features are matched.
     """
 
     def match(self, features1: Features, features2: Features) -> IndexPairs:
-        """Match two images; no feature occurs twice. Sorted by the feature of the first."""
+        """Match two images. Each feature occurs at most once; pairs are sorted by the first feature."""
         ...
 
 
-def unit_rows(
-    descriptors: Shaped[np.ndarray, "n d"], out: Float32[np.ndarray, "n d"] | None = None
-) -> Descriptors:
-    """Make descriptors comparable by their dot product: rows of length 1 (a row of zeros stays one).
-
-    Args:
-        descriptors: As an extractor stores them.
-        out: Where the rows go; new memory if not given.
-    """
-    rows = np.empty(descriptors.shape, np.float32) if out is None else out
-    np.copyto(rows, descriptors, casting="unsafe")
+def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
+    """Scale descriptors to unit length, so that dot products compare them. Rows of zeros stay zero."""
+    rows = np.array(descriptors, np.float32, order="C")
     lengths = np.sqrt(np.einsum("nd,nd->n", rows, rows))
     rows /= np.maximum(lengths, np.float32(1e-12))[:, None]
     return rows
@@ -92,7 +108,7 @@ def unit_rows(
 def image_colors(
     image: UInt8[np.ndarray, "h w 3"], keypoints: Float32[np.ndarray, "n 2"]
 ) -> UInt8[np.ndarray, "n 3"]:
-    """The RGB of the pixel that each keypoint lies in."""
+    """RGB of the pixel in which each keypoint lies."""
     limits = np.array(image.shape[1::-1]) - 1
     columns, rows = np.clip(keypoints.astype(np.int64), 0, limits).T
     return image[rows, columns]

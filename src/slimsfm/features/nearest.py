@@ -1,55 +1,23 @@
-"""Matching by descriptor distance: mutual nearest neighbours that pass Lowe's ratio test."""
-
-from dataclasses import dataclass
+"""Matching by descriptor distance: mutual nearest neighbors that pass Lowe's ratio test."""
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import IndexPairs
-from slimsfm.features.base import Features, unit_rows
+from slimsfm.features.base import Features, NearestOptions, unit_rows
+from slimsfm.features.registry import descriptor_metric_of
 
 _BLOCK = 256  # rows
 
 
-@dataclass(frozen=True, kw_only=True)
-class NearestOptions:
-    """Which nearest neighbours count as matches."""
-
-    max_ratio: float = 0.8
-    """Largest distance to the nearest over that to the second nearest."""
-
-    max_distance: float = 0.7
-    """Largest angle in radians between two matched descriptors."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_ratio <= 1:
-            raise ValueError(f"max_ratio must be in (0, 1], got {self.max_ratio}")
-        if not self.max_distance > 0:
-            raise ValueError(f"max_distance must be positive, got {self.max_distance}")
-
-
-SCALES = {
-    "sift": NearestOptions(),
-    "aliked": NearestOptions(max_ratio=0.95, max_distance=0.9),
-    "disk": NearestOptions(max_ratio=0.95, max_distance=0.9),
-    "superpoint": NearestOptions(max_ratio=0.95, max_distance=0.8),
-}
-"""Which neighbours match, by extractor: descriptors of different methods lie apart at different angles."""
-
-
-def nearest_for(extractor: str) -> NearestOptions:
-    """Which neighbours match among the descriptors of an extractor."""
-    return SCALES.get(extractor, NearestOptions())
-
-
 class Nearest:
-    """Matches the features of two images by `match_nearest`."""
+    """Matches the features of two images by descriptor distance."""
 
     def __init__(self, features: str = "sift") -> None:
-        self._options = nearest_for(features)
+        self._options = descriptor_metric_of(features)
 
     def match(self, features1: Features, features2: Features) -> IndexPairs:
-        """Match two images; no feature occurs twice. Sorted by the feature of the first."""
+        """Match two images. Each feature occurs at most once; pairs are sorted by the first feature."""
         descriptors = unit_rows(features1.descriptors), unit_rows(features2.descriptors)
         return match_nearest(*descriptors, self._options)
 
@@ -61,8 +29,8 @@ def match_nearest(
 ) -> Int64[np.ndarray, "k 2"]:
     """Match two sets of descriptors of unit length, as COLMAP does: mutual nearest, ratio test on angles.
 
-    Each row of either set is matched at most once. The ratio test applies on the side of `descriptors1`.
-    Complexity: O(n m d), one matrix product, taken in blocks of rows that stay in the processor's cache.
+    Each row of either set is matched at most once. The ratio test applies to the rows of `descriptors1`.
+    Complexity: O(n m d), one matrix product, computed in blocks of rows that stay in the processor's cache.
 
     Returns:
         Pairs (row of `descriptors1`, row of `descriptors2`), sorted by the first.
@@ -73,7 +41,7 @@ def match_nearest(
     angles = _angles(best)
     good = (angles <= options.max_ratio * _angles(second)) & (angles <= options.max_distance)
     rows = np.flatnonzero(good & (best >= best_of_column[nearest]))
-    _, first = np.unique(nearest[rows], return_index=True)  # equal descriptors: the first takes the match
+    _, first = np.unique(nearest[rows], return_index=True)  # of equal descriptors the first is matched
     rows = rows[np.sort(first)]
     return np.stack([rows, nearest[rows]], axis=1)
 
@@ -83,12 +51,12 @@ def _nearest_two(
 ) -> tuple[
     Int64[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " m"]
 ]:
-    """Each row's nearest of the other set, its cosine, that of the second nearest, and each column's best."""
+    """Nearest neighbor of each row, its cosine, the second best cosine, and the best of each column."""
     nearest = np.empty(len(descriptors1), np.int64)
     best, second = np.empty((2, len(descriptors1)), np.float32)
     best_of_column = np.full(len(descriptors2), -np.inf, np.float32)
     transposed = np.ascontiguousarray(descriptors2.T)
-    memory = np.empty((_BLOCK, len(descriptors2)), np.float32)  # one for all: fresh pages are dear
+    memory = np.empty((_BLOCK, len(descriptors2)), np.float32)  # reused: new pages are expensive
     for start in range(0, len(descriptors1), _BLOCK):
         block = slice(start, start + _BLOCK)
         rows = np.arange(len(descriptors1[block]))

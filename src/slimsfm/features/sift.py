@@ -1,8 +1,8 @@
-"""SIFT [1] with RootSIFT descriptors [2], interchangeable with those that COLMAP extracts.
+"""SIFT [1] with RootSIFT descriptors [2], interchangeable with COLMAP's.
 
-With its precise upscaling OpenCV finds COLMAP's keypoints to 0.001 px (median) in a fifth of the time, and
-their descriptors differ by no more than the rounding to bytes explains. A database of COLMAP's and this
-extractor may therefore serve the same map.
+With precise upscaling, OpenCV finds COLMAP's keypoints to 0.001 px (median) in a fifth of the time, and the
+descriptors differ only by the rounding to bytes. So features from a COLMAP database and from this extractor
+may be mixed.
 
 References:
     [1] Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004.
@@ -25,13 +25,13 @@ class Sift:
     """Extracts SIFT features."""
 
     max_features: int = 4096
-    """Keep this many keypoints, those of strongest contrast."""
+    """Largest number of keypoints; those with the strongest contrast are kept."""
 
     max_image_size: int = 1600
     """Shrink larger images so that their longer side has this many pixels."""
 
     contrast_threshold: float = 0.02
-    """Weakest contrast of a keypoint; 0.02 over three scales an octave is COLMAP's 0.0067 a scale."""
+    """Least contrast of a keypoint; 0.02 at three scales per octave equals COLMAP's 0.0067 per scale."""
 
     def __post_init__(self) -> None:
         if self.max_features < 1:
@@ -43,16 +43,16 @@ class Sift:
 
     @property
     def name(self) -> str:
-        """The name under which a map remembers its extractor."""
+        """Name of the extractor in a map's `map.json`."""
         return "sift"
 
     @property
     def options(self) -> dict:
-        """What `load_extractor` needs to make an equal extractor."""
+        """Options with which `load_extractor` creates an equal extractor."""
         return asdict(self)
 
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
-        """Find features; none where the mask, of the image's size, is 0."""
+        """Extract features; the mask has the size of the image, and no feature lies where it is 0."""
         height, width = image.shape[:2]
         scale = min(1.0, self.max_image_size / max(height, width))
         gray = shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8), self.max_image_size)
@@ -69,7 +69,7 @@ class Sift:
         frames = np.array([(keypoint.size, keypoint.angle) for keypoint in found], np.float32).reshape(-1, 2)
         # OpenCV's size is a diameter, its angle in degrees.
         frames *= np.array([0.5 / scale, np.pi / 180], np.float32)
-        # OpenCV may return a few more than asked where responses tie.
+        # OpenCV may return a few more than requested if responses tie.
         order = np.argsort(-scores, kind="stable")[: self.max_features]
         return Features(
             keypoints=(pixels * factors)[order],
@@ -81,6 +81,6 @@ class Sift:
 
 
 def root_sift(descriptors: Float32[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:
-    """Hellinger-normalized descriptors as bytes, 512 to the unit, as COLMAP stores them."""
+    """Apply the Hellinger kernel to descriptors, and store them as bytes, times 512, as COLMAP does."""
     sums = np.maximum(np.abs(descriptors).sum(axis=1, keepdims=True), 1e-12)
     return np.clip(np.round(512 * np.sqrt(descriptors / sums)), 0, 255).astype(np.uint8)

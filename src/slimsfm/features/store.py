@@ -1,13 +1,13 @@
 """Features and matches on disk, in hloc's HDF5 layout.
 
-`features.h5`: a group an image name with `keypoints` (n, 2), `descriptors` (d, n), `scores` (n) and
-`image_size` (2), and where the detector tells them `scales` (n) and `oris` (n): in radians, while hloc's own
-are in degrees, which is told by their being larger than a turn.
-`matches.h5`: a group `A/B` a pair of image names ("/" in a name written "-") with
-`matches0` (for each keypoint of A its match in B or -1) and `matching_scores0`.
+`features.h5`: one group per image name with `keypoints` (n, 2), `descriptors` (d, n), `scores` (n) and
+`image_size` (2), and if the detector estimates them `scales` (n) and `oris` (n). `oris` are in radians;
+hloc's own are in degrees and recognized by values larger than a full turn.
+`matches.h5`: one group `A/B` per pair of image names ("/" in a name becomes "-") with `matches0` (for each
+keypoint of A its match in B or -1) and `matching_scores0`.
 
-hloc puts the centre of the top-left pixel at (0, 0), everything else here at (0.5, 0.5). This file alone
-converts.
+hloc puts the center of the top-left pixel at (0, 0), everything else in slimsfm at (0.5, 0.5). Only this
+module converts.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,10 +34,10 @@ _TURN = 2 * np.pi + 0.01  # half floats round
 
 
 class FeatureFile(Mapping[str, Features]):
-    """The features of a file by image name, read when asked for; names are sorted.
+    """The features in a file by image name, sorted, read on access.
 
     Raises:
-        InputError: The file is missing or no such file, at construction; an entry is damaged, at access.
+        InputError: The file is missing or damaged, at construction; an entry is damaged, at access.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,7 +54,7 @@ class FeatureFile(Mapping[str, Features]):
             raise InputError(f"{self._path}: the features of {name!r} are damaged ({error})") from error
 
     def count(self, name: str) -> int:
-        """How many features an image has, without reading them."""
+        """Number of features of an image, without reading them."""
         keypoints = self._file[f"{name}/keypoints"]
         return keypoints.shape[0] if isinstance(keypoints, h5py.Dataset) and keypoints.shape else 0
 
@@ -69,11 +69,11 @@ class FeatureFile(Mapping[str, Features]):
 
 
 def read_array(file: h5py.File, name: str) -> np.ndarray:
-    """The values of a data set; KeyError where there is none. Five times faster than `file[name][()]`."""
+    """Read a dataset, five times faster than `file[name][()]`; KeyError if there is none."""
     try:
         found = h5py.h5d.open(file.id, name.encode())
     except TypeError as error:
-        raise KeyError(f"{name} is no data set") from error
+        raise KeyError(f"{name} is not a dataset") from error
     values = np.empty(found.shape, found.dtype)
     found.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values
@@ -110,12 +110,12 @@ def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, 
 
 
 class MatchFile(Mapping[tuple[str, str], IndexPairs]):
-    """The verified matches of a file by pair of image names, read when asked for.
+    """The verified matches in a file by pair of image names, read on access.
 
-    Each pair has one entry, in the order in which the file names it.
+    Each pair has one entry, in the order of names in the file.
 
     Raises:
-        InputError: The file is missing or no such file, at construction; an entry is damaged, at access.
+        InputError: The file is missing or damaged, at construction; an entry is damaged, at access.
     """
 
     def __init__(self, path: Path, names: list[str]) -> None:
@@ -147,7 +147,7 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
 
 
 class FeatureWriter:
-    """Writes features image by image, so that never all of them are in memory."""
+    """Writes features image by image, so that not all of them need to fit into memory."""
 
     def __init__(self, path: Path) -> None:
         self._closing = ExitStack()
@@ -165,7 +165,7 @@ class FeatureWriter:
             _write_features(self._file, name, features)
 
 
-# Functions of their own: the group they make is closed, which may write, when they end.
+# Separate functions, because closing their group at the end may write.
 
 
 def _write_features(file: h5py.File, name: str, features: Features) -> None:
@@ -201,8 +201,8 @@ def write_matches(
 
 @contextmanager
 def creating(path: Path) -> Iterator[h5py.File]:
-    """A new HDF5 file in place of one that may be there; a full disk is an OSError."""
-    path.unlink(missing_ok=True)  # who still reads an older file keeps it
+    """Create an HDF5 file, or replace it; a full disk raises OSError."""
+    path.unlink(missing_ok=True)  # open readers keep the old file
     with _PatientFile(path, "w+b") as raw:
         file = None
         try:
@@ -211,14 +211,14 @@ def creating(path: Path) -> Iterator[h5py.File]:
             yield file
         finally:
             with uninterrupted():
-                if file is not None:  # an interruption that was put off comes before it is handed out
+                if file is not None:  # a deferred interruption may arrive before the assignment
                     file.close()
         if raw.failure:
             raise raw.failure
 
 
 class _PatientFile(FileIO):
-    """Remembers that it could not be written: told that the disk is full, HDF5 crashes the process."""
+    """Records write errors instead of raising them, because HDF5 crashes the process if the disk is full."""
 
     failure: OSError | None = None
 
@@ -234,10 +234,10 @@ class _PatientFile(FileIO):
 
 
 def opened(path: Path) -> h5py.File:
-    """An HDF5 file to read.
+    """Open an HDF5 file for reading.
 
     Raises:
-        InputError: There is none, or it is damaged.
+        InputError: The file is missing or damaged.
     """
     try:
         return h5py.File(path, "r")

@@ -1,4 +1,4 @@
-"""Global descriptors of images from their local ones: VLAD [1], normalized word by word [2].
+"""Global image descriptors from local descriptors: VLAD [1] with normalization per word [2].
 
 References:
     [1] Jegou, Douze, Schmid and Perez, Aggregating Local Descriptors into a Compact Image Representation,
@@ -15,15 +15,15 @@ from scipy.sparse import csr_array
 from slimsfm.arrays import Descriptors
 
 NUM_WORDS = 64
-_SAMPLE = 20_000  # descriptors that words are learned from
+_SAMPLE = 20_000  # descriptors from which words are learned
 _ROUNDS = 8  # of k-means
 
 
 def learn_words(descriptors: Descriptors, seed: int = 0) -> Float32[np.ndarray, "words d"]:
-    """Cluster centres of descriptors, by k-means; fewer than 64 where there are fewer descriptors.
+    """Cluster descriptors into 64 words by k-means, or fewer if there are fewer descriptors.
 
     Raises:
-        ValueError: There is no descriptor.
+        ValueError: `descriptors` is empty.
     """
     from scipy.cluster.vq import kmeans2  # slow to import, and only needed here
 
@@ -34,21 +34,21 @@ def learn_words(descriptors: Descriptors, seed: int = 0) -> Float32[np.ndarray, 
         descriptors = descriptors[np.sort(rng.choice(len(descriptors), _SAMPLE, replace=False))]
     count = min(NUM_WORDS, len(descriptors))
     first = descriptors[np.sort(rng.choice(len(descriptors), count, replace=False))]
-    with warnings.catch_warnings(action="ignore", category=UserWarning):  # a word without members stays
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # an empty word keeps its position
         words, _ = kmeans2(descriptors, first, iter=_ROUNDS, minit="matrix", missing="warn")
     return np.ascontiguousarray(words, np.float32)
 
 
 def nearest_word(descriptors: Descriptors, words: Float32[np.ndarray, "words d"]) -> Int64[np.ndarray, " n"]:
-    """The row of the word nearest to each descriptor."""
+    """Row of the nearest word of each descriptor."""
     return np.argmax(descriptors @ words.T - 0.5 * np.einsum("wd,wd->w", words, words), axis=1)
 
 
 def vlad(descriptors: Descriptors, words: Float32[np.ndarray, "words d"]) -> Float32[np.ndarray, " words*d"]:
-    """One row of unit length for all descriptors of an image; zeros where it has none.
+    """Aggregate the descriptors of an image into one vector of unit length; zeros if there are none.
 
-    Of each word the differences of its descriptors from it are summed up and made of unit length, so that no
-    texture counts more for being repeated. O(n words d).
+    Per word, the differences of its descriptors from it are summed and scaled to unit length, so that
+    repeated texture does not count more. O(n words d).
     """
     count = len(descriptors)
     nearest = nearest_word(descriptors, words)

@@ -11,7 +11,6 @@ import numpy as np
 import pycolmap
 from jaxtyping import Int64
 
-from slimsfm.features import nearest_for
 from slimsfm.localization.matching import match_target
 from slimsfm.localization.point_descriptors import mean_descriptors
 from slimsfm.localization.strategy import MatchingOptions, Query, Rounds, Target, unite
@@ -24,8 +23,10 @@ _NARROWEST = 0.5  # cosine: a point may be visible 60 degrees away from where it
 class Direct:
     """Matches against all described points at once. O(keypoints x points) per query."""
 
+    requires = "points"
+
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:  # noqa: ARG002
-        self._nearest = nearest_for(map.info.extractor)
+        self._nearest = map.descriptor_metric
         self._described = map.point_descriptors or mean_descriptors(map)
         self._positions = map.points3D_in_world[self._described.points].astype(np.float32)
         self._target = self._described.descriptors, self._described.points

@@ -1,6 +1,6 @@
 """Localize a query image against one map."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -9,7 +9,7 @@ import pycolmap
 
 from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
-from slimsfm.features.methods import DETECTOR_FREE, importing, plugins, resolve
+from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.guided_matching import extract_near
 from slimsfm.localization.search import RoundResult, Search, SearchResult
@@ -21,8 +21,8 @@ from slimsfm.pose import Gravity, PoseEstimate, RansacOptions
 STRATEGIES = {
     "direct": "slimsfm.localization.direct:Direct",
     "exhaustive": "slimsfm.localization.reference_images:Exhaustive",
-    "onepose": "slimsfm.localization.onepose:OnePose",
-    "onepose++": "slimsfm.localization.onepose_plus:OnePosePlus",
+    "onepose": "slimsfm.methods.onepose.strategy:OnePoseStrategy",
+    "onepose++": "slimsfm.methods.onepose_plus.strategy:OnePosePlusStrategy",
     "progressive": "slimsfm.localization.progressive:Progressive",
     "retrieval": "slimsfm.localization.reference_images:Retrieval",
 }
@@ -62,7 +62,7 @@ class LocalizationOptions:
         """Name of the strategy to use with a map."""
         if self.strategy != "auto":
             return self.strategy
-        if map.info.extractor in DETECTOR_FREE:
+        if not map.has_keypoints:
             return "exhaustive"
         return "progressive" if map.point_descriptors is None else "direct"
 
@@ -75,7 +75,24 @@ def load_strategy(name: str, map: Map, options: MatchingOptions = MatchingOption
         MapError: The strategy cannot work with this kind of map.
     """
     with importing(f"strategy {name!r}"):
-        return resolve({**plugins("strategy"), **STRATEGIES}[name])(map, options)
+        return _strategy_class(name)(map, options)
+
+
+def supports(strategy: str, map: Map) -> bool:
+    """Whether a map has what the strategy of this name requires.
+
+    Raises:
+        InputError: A package that the strategy needs is missing.
+    """
+    if strategy == "auto":
+        return True
+    with importing(f"strategy {strategy!r}"):
+        requires = getattr(_strategy_class(strategy), "requires", "features")
+    return map.has_keypoints if requires == "points" else not map.is_for_direct_matching
+
+
+def _strategy_class(name: str) -> Callable[[Map, MatchingOptions], Strategy]:
+    return load_object({**plugins("strategy"), **STRATEGIES}[name])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +211,7 @@ class Localizer:
     @property
     def looks_at_images(self) -> bool:
         """Whether `localize_features` needs the image too, because the strategy looks at it."""
-        return isinstance(self._strategy, PoseGuided) or self.map.info.extractor in DETECTOR_FREE
+        return isinstance(self._strategy, PoseGuided) or not self.map.has_keypoints
 
     def localize_features(
         self,

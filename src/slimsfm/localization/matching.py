@@ -1,13 +1,19 @@
 """Match a query with one reference image: by nearest descriptors, by a network, or without keypoints."""
 
 from functools import lru_cache
-from importlib import import_module
 from typing import Protocol, runtime_checkable
 
 from slimsfm.arrays import Descriptors
-from slimsfm.features import Features, Matcher, load_matcher, match_nearest, nearest_for, unit_rows
-from slimsfm.features.methods import DETECTOR_FREE
-from slimsfm.features.nearest import NearestOptions
+from slimsfm.errors import InputError
+from slimsfm.features import (
+    Features,
+    Matcher,
+    NearestOptions,
+    load_extractor,
+    load_matcher,
+    match_nearest,
+    unit_rows,
+)
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target
 from slimsfm.mapping.map import Map
 
@@ -39,6 +45,15 @@ class ReferenceMatching(Protocol):
         ...
 
 
+@runtime_checkable
+class WholeImageExtractor(Protocol):
+    """An extractor without keypoints, which provides its own way to match a query with reference images."""
+
+    def reference_matching(self, map: Map) -> ReferenceMatching:
+        """Prepare matching for a map that this extractor built."""
+        ...
+
+
 def matching_with(map: Map, options: MatchingOptions, cached: int | None = None) -> ReferenceMatching:
     """Create the matching that the options ask for.
 
@@ -51,14 +66,14 @@ def matching_with(map: Map, options: MatchingOptions, cached: int | None = None)
         InputError: The matcher is unknown, or cannot match features of the map's kind.
     """
     extractor = map.info.extractor
-    name = options.matcher
-    if name == "auto":
-        name = extractor if extractor in DETECTOR_FREE else "nearest"
-    if name == "nearest":
-        return NearestMatching(map, nearest_for(extractor), cached)
-    if name in DETECTOR_FREE:
-        return import_module("slimsfm.localization.detector_free").DetectorFreeMatching(map)
-    return PairMatching(map, load_matcher(name, extractor), cached)
+    if not map.has_keypoints and options.matcher in ("auto", extractor):
+        made = load_extractor(extractor, map.info.extractor_options)
+        if isinstance(made, WholeImageExtractor):
+            return made.reference_matching(map)
+        raise InputError(f"extractor {extractor!r} finds no keypoints and has no `reference_matching`")
+    if options.matcher in ("auto", "nearest"):
+        return NearestMatching(map, map.descriptor_metric, cached)
+    return PairMatching(map, load_matcher(options.matcher, extractor), cached)
 
 
 class NearestMatching:

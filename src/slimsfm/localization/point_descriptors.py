@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from slimsfm.arrays import Descriptors, Mask
-from slimsfm.features import nearest_for, unit_rows
+from slimsfm.features import unit_rows
 from slimsfm.features.vlad import learn_words, nearest_word
 from slimsfm.mapping.map import Map, PointDescriptors
 
@@ -72,7 +72,7 @@ def _distinct(map: Map, descriptors: Descriptors) -> Mask:
     points, far = map.points3D_in_world, _FAR * map.box.diagonal
     if not len(points):
         return np.zeros(0, dtype=bool)
-    alike_at = np.cos(_ALIKE * nearest_for(map.info.extractor).max_distance)
+    alike_at = np.cos(_ALIKE * map.descriptor_metric.max_distance)
     words = map.global_descriptors.vocabulary if map.global_descriptors else learn_words(descriptors)
     word_of = nearest_word(descriptors, words)
     distinct = np.ones(len(points), dtype=bool)

@@ -10,7 +10,7 @@ import pycolmap
 from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import Ids
-from slimsfm.features import nearest_for, unit_rows
+from slimsfm.features import unit_rows
 from slimsfm.localization.matching import match_target
 from slimsfm.localization.point_descriptors import descriptor_sums
 from slimsfm.localization.reference_images import ImageRanking, ReferenceImages
@@ -28,7 +28,7 @@ class Progressive:
     """Matches with the most likely images first, and with all of them if the pose stays unsure."""
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._nearest = nearest_for(map.info.extractor)
+        self._nearest = map.descriptor_metric
         self._references = ReferenceImages(map, options)
         self._ranking = ImageRanking(map)
         landmarks = choose_landmarks(map)

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import pycolmap
 
-from slimsfm.features import nearest_for
 from slimsfm.geometry import project
 from slimsfm.localization.cameras import FocalLength
 from slimsfm.localization.guided_matching import match_near
@@ -108,7 +107,7 @@ class Search:
         else:
             target = self._strategy.visible_points(near_cam_from_world)
             pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
-            matches = match_near(query, target, pixels, camera, nearest_for(self._map.info.extractor))
+            matches = match_near(query, target, pixels, camera, self._map.descriptor_metric)
         return _summed([self._result(query, matches, camera, start)])
 
     def rounds(

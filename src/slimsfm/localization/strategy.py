@@ -91,7 +91,11 @@ Rounds = Generator[PointMatches, PoseEstimate | None, None]
 
 @runtime_checkable
 class Strategy(Protocol):
-    """Matches queries against one map. Created once per map, called for every query, on any thread."""
+    """Matches queries against one map. Created once per map, then called for every query, on any thread.
+
+    A class may state what it requires of a map by the attribute `requires`: "points", described points that
+    queries are matched with directly, or "features" (the default), features of the reference images.
+    """
 
     def rounds(self, query: Query) -> Rounds:
         """Match a query in rounds, the most likely matches first.

@@ -24,7 +24,6 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
-from slimsfm.features import nearest_for
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map
@@ -107,7 +106,7 @@ class Verifier:
         self._points3D_in_world = map.points3D_in_world
         self._box = map.box
         self._strategy = strategy
-        self._alike = nearest_for(map.info.extractor).max_distance
+        self._alike = map.descriptor_metric.max_distance
         self._distinct = distinct
 
     def evidence(

@@ -5,25 +5,20 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Protocol, runtime_checkable
 
 import pycolmap
 
+from slimsfm.arrays import Image
 from slimsfm.errors import InputError
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
-from slimsfm.features.image_matching import Photo, load_image_matcher
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.box import estimate_box, read_box
-from slimsfm.mapping.build_keypoint_free import PhotoFolder, build_without_keypoints
-from slimsfm.mapping.cell_keypoints import Matches
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
-from slimsfm.mapping.image_pairs import choose_image_pairs
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.pairs import PairChoice, choose_pairs, match_pairs_with, verify_pairs
-from slimsfm.mapping.photo_file import shrink_photo
+from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.sfm import (
     colmap_warnings,
     match_pairs,
@@ -35,7 +30,6 @@ from slimsfm.mapping.sfm import (
 )
 from slimsfm.photos import list_images
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.weights import find_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,12 +121,17 @@ def build_map(
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
     cameras = known.cameras if known else guess_cameras(images, names, options.camera)
-    make_parts = _parts_without_keypoints if extractor.name in DETECTOR_FREE else _parts_with_keypoints
     with _opened(workspace) as folder, colmap_warnings():
-        parts = make_parts(_Work(images, names, folder, cameras, known, progress), extractor, options)
+        work = BuildWork(
+            images=images, names=names, workspace=folder, cameras=cameras, known=known, progress=progress
+        )
+        if isinstance(extractor, ModelBuilder):
+            parts = extractor.build_model(work, options)
+        else:
+            parts = _parts_with_keypoints(work, extractor, options)
     info = MapInfo(
-        extractor=extractor.name,
-        extractor_options=extractor.options,
+        extractor=parts.extractor.name,
+        extractor_options=parts.extractor.options,
         box=given_box or estimate_box(parts.model),
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
@@ -162,27 +161,63 @@ def _opened(workspace: str | Path | None) -> Iterator[Path]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Parts:
-    """The parts of a map that come from its images."""
-
-    model: pycolmap.Reconstruction
-    features: Mapping[str, Features]
-    matches: Matches
-    photos: Mapping[str, Photo] = field(default_factory=dict)
-
-
-class _Work(NamedTuple):
-    """Input of both ways of building, with and without keypoints."""
+class BuildWork:
+    """What a model is built from."""
 
     images: Path
+    """Folder of the photos."""
+
     names: list[str]
+    """Names of the photos to use, relative to the folder."""
+
     workspace: Path
+    """Folder for intermediate files."""
+
     cameras: Mapping[str, pycolmap.Camera]
+    """Intrinsics by image name; images with equal `camera_id` share a camera."""
+
     known: KnownPoses | None
+    """Known poses, if any: then points are triangulated and nothing else is estimated."""
+
     progress: ProgressBar
+    """Progress callback."""
 
 
-def _parts_with_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapParts:
+    """A model and the data that its map stores with it."""
+
+    extractor: Extractor
+    """Extractor that the map records for queries."""
+
+    model: pycolmap.Reconstruction
+    """The SfM model; keypoint i of an image is row i of its features."""
+
+    features: Mapping[str, Features]
+    """Local features by image name."""
+
+    matches: Matches
+    """Verified matches by pair of image names."""
+
+    photos: Mapping[str, Image] = field(default_factory=dict)
+    """Small photos by image name, for extractors without keypoints."""
+
+
+@runtime_checkable
+class ModelBuilder(Protocol):
+    """An extractor that builds the model of a map itself, because it finds no keypoints."""
+
+    def build_model(self, work: BuildWork, options: BuildOptions) -> MapParts:
+        """Build a model from photos.
+
+        Raises:
+            InputError: A photo, a mask or an option cannot be used.
+            ReconstructionError: The images give no model.
+        """
+        ...
+
+
+def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
     features, colors = extract_features(work.images, names, extractor, options.masks, output, work.progress)
     database, sfm = _match(work, features, options), work.workspace / "sfm"
@@ -195,38 +230,17 @@ def _parts_with_keypoints(work: _Work, extractor: Extractor, options: BuildOptio
     put_keypoints(model, features)
     color_points(model, colors)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    return _Parts(model=model, features=features, matches=matches)
-
-
-def _parts_without_keypoints(work: _Work, extractor: Extractor, options: BuildOptions) -> _Parts:
-    photos = PhotoFolder(work.images, work.names)
-    poses = work.known.cam_from_world if work.known else None
-    made = build_without_keypoints(
-        photos,
-        choose_image_pairs(work.names, options.pairs, poses),
-        load_image_matcher(extractor.name, extractor.options),
-        work.cameras,
-        work.workspace,
-        cam_from_world=poses,
-        masks=options.masks,
-        seed=options.seed,
-        progress=work.progress,
-    )
-    limit = extractor.options["max_image_size"]
-    small = {name: shrink_photo(photos[name], limit) for name in made.features}
-    return _Parts(model=made.model, features=made.features, matches=made.matches, photos=small)
+    return MapParts(extractor=extractor, model=model, features=features, matches=matches)
 
 
 def _extractor(options: BuildOptions) -> Extractor:
     wanted: dict = {"max_features": options.max_features, "max_image_size": options.max_image_size}
-    if options.extractor in DETECTOR_FREE and find_weights("loftr-onepose++"):
-        wanted["weights"] = "loftr-onepose++"  # the map then serves OnePose++ as well
     return load_extractor(
         options.extractor, {key: value for key, value in wanted.items() if value is not None}
     )
 
 
-def _match(work: _Work, features: FeatureFile, options: BuildOptions) -> Path:
+def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Path:
     database = work.workspace / "database.db"
     write_database(database, features, work.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)

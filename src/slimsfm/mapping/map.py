@@ -13,7 +13,8 @@ from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, Image, IndexPairs, Mask, Points3D
 from slimsfm.errors import MapError
-from slimsfm.features import Features
+from slimsfm.features import Features, NearestOptions
+from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
 
 MapKind = Literal["full", "images", "points", "images and points"]
@@ -150,6 +151,16 @@ class Map:
     def is_for_direct_matching(self) -> bool:
         """Whether the map holds points for direct matching but no image features."""
         return not self.features and self.point_descriptors is not None
+
+    @property
+    def descriptor_metric(self) -> NearestOptions:
+        """How the map's descriptors compare: which nearest neighbors count as matches."""
+        return descriptor_metric_of(self.info.extractor)
+
+    @property
+    def has_keypoints(self) -> bool:
+        """Whether the map's extractor finds keypoints; otherwise images are matched as a whole."""
+        return finds_keypoints(self.info.extractor)
 
     @property
     def box(self) -> Box:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.features import Features, Matcher, unit_rows
@@ -18,6 +18,9 @@ from slimsfm.progress import ProgressBar, silent, single_step
 
 Pairs = list[tuple[str, str]]
 """Pairs of image names: each pair is sorted, and so is the list, without duplicates."""
+
+Matches = Mapping[tuple[str, str], Int64[np.ndarray, "_ 2"]]
+"""Pairs (row of the first image's keypoints, row of the second's), by pair of image names."""
 
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 

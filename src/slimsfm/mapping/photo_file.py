@@ -1,6 +1,6 @@
-"""The reference photos, small: for matching without keypoints, which looks at the photos themselves.
+"""Small reference photos, for matching without keypoints.
 
-`photos.h5` holds a JPEG file an image name.
+`photos.h5` holds one JPEG file per image name.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,10 +20,10 @@ _QUALITY = 95
 
 
 class PhotoFile(Mapping[str, Image]):
-    """The photos of a file by image name, read when asked for; names are sorted.
+    """The photos in a file by image name, sorted, read on access.
 
     Raises:
-        InputError: The file is missing or no such file, at construction; a photo is damaged, at access.
+        InputError: The file is missing or damaged, at construction; a photo is damaged, at access.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +56,7 @@ class PhotoFile(Mapping[str, Image]):
 
 
 def write_photos(path: Path, photos: Mapping[str, Image]) -> None:
-    """Write photos, in sorted order of their names."""
+    """Write photos, sorted by name."""
     with creating(path) as file:
         for name in sorted(photos):
             file[name] = _jpeg(photos[name])
@@ -68,5 +68,5 @@ def _jpeg(photo: Image) -> np.ndarray:
 
 
 def shrink_photo(photo: Image, max_image_size: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Shrink a photo, unless it is small, so that its longer side has so many pixels; as it is read back."""
+    """Shrink a photo to a longer side of at most `max_image_size` pixels, with the losses of JPEG."""
     return np.asarray(cv2.imdecode(_jpeg(shrink(photo, max_image_size)), cv2.IMREAD_COLOR_RGB), np.uint8)

@@ -1,1 +1,1 @@
-"""Networks in PyTorch, by the names that their published weights use."""
+"""Running neural networks: loading weights, choosing a device, ONNX files."""

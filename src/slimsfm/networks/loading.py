@@ -1,4 +1,4 @@
-"""Weights into networks: whole and fitting, or not at all."""
+"""Loading weights into networks: every value with the right name and shape, or nothing."""
 
 import pickle
 from collections.abc import Callable, Collection, Mapping
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from slimsfm.errors import InputError
 from slimsfm.networks.devices import choose_device
-from slimsfm.weights import WEIGHTS, check_weights, find_weights, missing, remind_of_licence
+from slimsfm.weights import WEIGHTS, check_weights, find_weights, missing, remind_of_license
 
 Network = TypeVar("Network", bound=nn.Module)
 State = dict[str, Tensor]
@@ -29,20 +29,20 @@ def load_network(
     state_of: Callable[[Mapping], State] = dict,
     derived: Collection[str] = (),
 ) -> Network:
-    """Fill a network with published weights and put it where networks run, ready for inference.
+    """Load published weights into a network, and move it to the device, ready for inference.
 
     Args:
-        network: As constructed.
+        network: An untrained network.
         name: Key of `slimsfm.weights.WEIGHTS`.
-        state_of: Makes the network's own state dict of what the file holds.
-        derived: Values that the network computes itself, which a file may lack.
+        state_of: Converts the contents of the file to the state dict of the network.
+        derived: Values that the network computes itself and that may be missing in the file.
 
     Raises:
         InputError: The weights are missing, damaged, or of another network.
     """
     path = find_weights(name) or _from_hub(name)
     load_state(network, path, state_of, derived)
-    remind_of_licence(name)
+    remind_of_license(name)
     return network.to(choose_device()).eval().requires_grad_(False)
 
 
@@ -52,7 +52,7 @@ def load_state(
     state_of: Callable[[Mapping], State] = dict,
     derived: Collection[str] = (),
 ) -> None:
-    """Load a file into a network, every value of it or none; arguments as of `load_network`.
+    """Load a file into a network completely or not at all; for the arguments see `load_network`.
 
     Raises:
         InputError: The file is damaged or of another network.
@@ -71,6 +71,18 @@ def load_state(
     network.load_state_dict(state, strict=True)
 
 
+def matcher_state(checkpoint: Mapping) -> State:
+    """Extract the matcher from a training checkpoint of LoFTR, OnePose or OnePose++.
+
+    Names begin with `matcher.` in the authors' files, which may also hold an extractor, and without in
+    kornia's.
+    """
+    prefix = "matcher."
+    state = checkpoint["state_dict"]
+    own = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+    return own or dict(state)
+
+
 def _difference(wanted: dict[str, tuple], found: dict[str, tuple]) -> str:
     key = min(key for key in wanted.keys() | found.keys() if wanted.get(key) != found.get(key))
     if key not in found:
@@ -85,7 +97,7 @@ def _name(network: nn.Module) -> str:
 
 
 def _read(path: Path) -> Mapping:
-    """What a file of weights holds, without running any code that it may hold."""
+    """Read a weight file without running code that it may contain."""
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -94,12 +106,12 @@ def _read(path: Path) -> Mapping:
         return torch.load(path, map_location="cpu", weights_only=False, pickle_module=_HARMLESS)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # what a damaged file raises is anybody's guess
-        raise InputError(f"{path}: not a file of weights, or damaged ({error})") from error
+    except Exception as error:  # damaged files raise all kinds of exceptions
+        raise InputError(f"{path}: not a weight file, or damaged ({error})") from error
 
 
 class _Ignored(dict):
-    """Stands for what checkpoints of training frameworks hold beside weights."""
+    """Replaces the other objects in checkpoints of training frameworks."""
 
     def __new__(cls, *_args: object, **_kwargs: object) -> "_Ignored":
         return super().__new__(cls)
@@ -131,7 +143,7 @@ _HARMLESS.load = lambda file, **options: _Unpickler(file, **options).load()  # p
 
 
 def _from_hub(name: str) -> Path:
-    """The file in its library's cache, where the library puts it if there is a network."""
+    """The file in the cache of its library, which downloads it if there is a network."""
     weights = WEIGHTS[name]
     for address in weights.hub:
         path = _from_hugging_face(address) if address.startswith("hf:") else _from_address(address)
@@ -153,12 +165,12 @@ def _from_hugging_face(address: str) -> Path | None:
         return None
     try:
         return Path(hf_hub_download(f"{owner}/{repository}", file))
-    except Exception:  # no network, no such file, an odd proxy: all mean that it cannot be had
+    except Exception:  # no network, no such file, a proxy: in any case it is not available
         return None
 
 
 def _is_known(address: str) -> bool:
-    """Whether a host can be found: without a network, libraries try for half a minute and say so."""
+    """Whether a host name resolves: without a network, libraries retry for half a minute with warnings."""
     if getproxies():
         return True
     try:

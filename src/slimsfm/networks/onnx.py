@@ -1,7 +1,7 @@
 """Networks as ONNX files: written by PyTorch's exporter, run by onnxruntime on the CPU.
 
-A file METHOD.onnx in the folder of weights is what this method runs by on the CPU. It knows what it was made
-of, so that one of another method or of other weights is told, not run.
+If the weights folder holds METHOD.onnx, the method runs it on the CPU. The file records its method and the
+checksum of its weights, and is refused if they do not match.
 """
 
 import hashlib
@@ -21,34 +21,34 @@ from torch import Tensor, nn
 
 from slimsfm.errors import InputError
 from slimsfm.networks.devices import choose_device
-from slimsfm.weights import WEIGHTS, find_weights, remind_of_licence, weights_folder
+from slimsfm.weights import WEIGHTS, current_runtime, find_weights, remind_of_license
 
 Run = Callable[..., tuple[Tensor, ...]]
-"""Takes a network's inputs in their order and gives its outputs in theirs."""
+"""Takes the inputs of a network in order, and returns its outputs in order."""
 
-_METHOD, _WEIGHTS = "slimsfm.method", "slimsfm.weights"  # keys of what a file knows of itself
+_METHOD, _WEIGHTS = "slimsfm.method", "slimsfm.weights"  # keys of the metadata in a file
 _NOISY = "torch.onnx", "torch.export", "onnxscript", "onnx_ir"  # loggers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exportable:
-    """What of a network an ONNX file holds: a static graph from tensors to tensors."""
+    """The exportable part of a network: a static graph from tensors to tensors."""
 
     network: nn.Module
-    """Takes the inputs, one after the other; ready for inference, on the CPU."""
+    """Takes the inputs in order; on the CPU, in evaluation mode."""
 
     inputs: dict[str, Tensor]
-    """Example of each, by name: axes that may have any length must be longer than 1 and differ in length."""
+    """Example inputs by name; the dynamic axes must be longer than 1 and differ in length."""
 
     dynamic: dict[str, tuple[int, ...]]
-    """For each input the axes that may have any length."""
+    """Axes of any length, by input."""
 
     outputs: tuple[str, ...]
-    """Names of what the network gives."""
+    """Names of the outputs."""
 
 
 class _Positional(nn.Module):
-    """Takes any number of inputs as such, so that the exporter needs to know no names."""
+    """Takes any number of positional inputs, so that the exporter does not need their names."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -62,12 +62,12 @@ def write_onnx(part: Exportable, method: str, path: Path) -> None:
     """Write an ONNX file.
 
     Args:
-        part: What it is to hold.
-        method: Key of `slimsfm.weights.WEIGHTS`: whose network it is.
-        path: Where it goes.
+        part: The network to export.
+        method: Key of `slimsfm.weights.WEIGHTS`.
+        path: Path of the file.
 
     Raises:
-        InputError: What writes ONNX is not installed.
+        InputError: A package for writing ONNX files is not installed.
     """
     for package in ("onnx", "onnxscript"):
         _import(package)
@@ -84,24 +84,24 @@ def write_onnx(part: Exportable, method: str, path: Path) -> None:
             verbose=False,
         )
     if program is None:
-        raise RuntimeError("torch.onnx.export gave nothing")
+        raise RuntimeError("torch.onnx.export returned nothing")
     for node in program.model.graph:
-        node.metadata_props.clear()  # where in whose source each comes from
+        node.metadata_props.clear()  # the stack trace of each node
     program.model.metadata_props.update({_METHOD: method, _WEIGHTS: _checksum(method)})
     program.save(path)
 
 
 def onnx_run(method: str) -> Run | None:
-    """What runs a method by onnxruntime; None where PyTorch is to: on a GPU, or without a METHOD.onnx.
+    """Load METHOD.onnx from the weights folder; None if there is no such file, or networks run on a GPU.
 
     Args:
         method: Key of `slimsfm.weights.WEIGHTS`.
 
     Raises:
-        InputError: The file is damaged, of another method or of other weights than the folder holds, or
-            onnxruntime is not installed.
+        InputError: The file is damaged or belongs to another method or to other weights than those in the
+            folder, or onnxruntime is not installed.
     """
-    folder = weights_folder()
+    folder = current_runtime().weights
     path = folder / f"{method}.onnx" if folder else None
     if path is None or not path.is_file() or choose_device().type != "cpu":
         return None
@@ -115,15 +115,15 @@ def _load(path: Path, method: str, threads: int, _size: int, _changed: int) -> R
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3  # errors
-    # Threads that wait for work by spinning take the cores from PyTorch, which does the rest.
+    # Spinning threads would take the cores from PyTorch, which runs the rest of the method.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # what a damaged file raises is anybody's guess
+    except Exception as error:  # damaged files raise all kinds of exceptions
         reason = str(error).partition("\n")[0]
-        raise InputError(f"{path}: onnxruntime cannot read it ({reason}); {_anew(method)}") from error
+        raise InputError(f"{path}: onnxruntime cannot read it ({reason}); {_remedy(method)}") from error
     _check_origin(path, method, session.get_modelmeta().custom_metadata_map)
-    remind_of_licence(method)
+    remind_of_license(method)
     names = [one.name for one in session.get_inputs()]
 
     def run(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -136,18 +136,20 @@ def _load(path: Path, method: str, threads: int, _size: int, _changed: int) -> R
 
 def _check_origin(path: Path, method: str, origin: dict[str, str]) -> None:
     if origin.get(_METHOD) != method:
-        raise InputError(f"{path}: was not made by slimsfm export onnx {method}; {_anew(method)}")
+        raise InputError(f"{path}: was not written by slimsfm export onnx {method}; {_remedy(method)}")
     here = _checksum(method)
     if here and origin.get(_WEIGHTS) and here != origin[_WEIGHTS]:
-        raise InputError(f"{path}: was made of other weights than {WEIGHTS[method].file}; {_anew(method)}")
+        raise InputError(
+            f"{path}: was exported from other weights than {WEIGHTS[method].file}; {_remedy(method)}"
+        )
 
 
-def _anew(method: str) -> str:
-    return f"remove it, or make it anew by slimsfm export onnx {method}"
+def _remedy(method: str) -> str:
+    return f"remove it, or export it again with slimsfm export onnx {method}"
 
 
 def _checksum(method: str) -> str:
-    """Of the file of weights in the user's folder; nothing where there is none."""
+    """Checksum of the weight file in the weights folder; empty if it is not there."""
     path = find_weights(method)
     return hashlib.sha256(path.read_bytes()).hexdigest() if path else ""
 
@@ -163,7 +165,7 @@ def _import(package: str) -> Any:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what the exporter says of its own insides from the user."""
+    """Suppress warnings and logs of the exporter."""
     loggers = [logging.getLogger(name) for name in _NOISY]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

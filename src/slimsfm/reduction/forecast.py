@@ -16,8 +16,6 @@ from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
-from slimsfm.features import nearest_for
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.geometry import corner_error, reprojection_errors
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import Target, unite
@@ -82,9 +80,9 @@ class Trials:
     def __init__(self, map: Map, left_out: LeftOut) -> None:
         self._map = map
         self._left_out = left_out
-        self._matching = nearest_for(map.info.extractor)
+        self._matching = map.descriptor_metric
         names = list(map.images)
-        most = 0 if map.info.extractor in DETECTOR_FREE else _MOST_TESTS  # a query has no descriptors
+        most = _MOST_TESTS if map.has_keypoints else 0  # a query has no descriptors
         places = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
         self.tests = tuple(names[place] for place in places)
         sees = observed(map).astype(np.int32)

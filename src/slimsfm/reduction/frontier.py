@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from slimsfm.errors import MapError
-from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.mapping.subset import keep_images
@@ -104,7 +103,7 @@ def frontier(
         ValueError: Images are to be chosen but there is no graph.
     """
     check_has_features(map)
-    if map.info.extractor in DETECTOR_FREE:
+    if not map.has_keypoints:
         raise MapError(
             "the map was built without a detector: what it loses cannot be foretold from its features; "
             "choose images by `slimsfm reduce MAP -o SMALL --solver exact`"

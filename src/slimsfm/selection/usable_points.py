@@ -63,7 +63,7 @@ def _points_near(map: Map) -> list[Ids]:
 
 def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.ndarray, " found"]:
     query = left_out.query(name)
-    pairs = match_nearest(query.descriptors, left_out.describe(points, name))
+    pairs = match_nearest(query.descriptors, left_out.describe(points, name), map.descriptor_metric)
     matched = points[pairs[:, 1]]
     errors = reprojection_errors(
         query.keypoints[pairs[:, 0]],

@@ -1,0 +1,1 @@
+"""LoFTR: maps and matches without a keypoint detector."""

@@ -1,0 +1,139 @@
+"""Keypoints without a detector: the cells of an image that match a cell of any other image [1].
+
+References:
+    [1] He, Sun, Wang, Huang, Bao and Zhou, OnePose++: Keypoint-Free One-Shot Object Pose Estimation
+        without CAD Models, NeurIPS 2022.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from slimsfm.arrays import IndexPairs, Mask, Points2D
+from slimsfm.features import Features
+from slimsfm.mapping.pairs import Matches, Pairs
+from slimsfm.methods.loftr.image_matching import ImageMatcher, ImageMatches, Photo, PhotoMask
+from slimsfm.progress import ProgressBar, silent
+
+_CACHED = 200  # images kept in memory, encoded for matching cells: 5 MB each at 640 x 480
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CellKeypoints:
+    """The matched cells of all images."""
+
+    features: Mapping[str, Features]
+    """Cells by image name, by decreasing sum of scores; descriptors are empty."""
+
+    matches: Matches
+    """Matches by pair of names, sorted; pairs without matches are omitted."""
+
+    cell_px: Mapping[str, float]
+    """Side of a cell in pixels, by image name."""
+
+
+def match_without_keypoints(
+    photos: Mapping[str, Photo],
+    pairs: Pairs,
+    matcher: ImageMatcher,
+    masks: Mapping[str, PhotoMask] | None = None,
+    progress: ProgressBar = silent,
+) -> CellKeypoints:
+    """Match the cells of pairs of photos, and number the matched cells.
+
+    Args:
+        photos: Photos by name, read on access.
+        pairs: Pairs of names.
+        matcher: Matches the photos.
+        masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
+        progress: Progress callback.
+    """
+    encode = lru_cache(_CACHED)(lambda name: matcher.encode(photos[name], cells_only=True))
+    found = {}
+    for a, b in progress(in_tiles(pairs, _CACHED // 2), "match images"):
+        matches = matcher.match_cells(encode(a), encode(b))
+        found[a, b] = _within(matches, (masks or {}).get(a), (masks or {}).get(b))
+    names = sorted(photos)
+    cells = _numbered(names, {pair: found[pair] for pair in sorted(found)})
+    return CellKeypoints(
+        features={name: cells[name].features(encode(name).image_size) for name in names},
+        matches={(a, b): cells[a].pairs(cells[b], (a, b)) for a, b in sorted(found) if len(found[a, b])},
+        cell_px={name: encode(name).cell_px for name in names},
+    )
+
+
+def in_tiles(pairs: Pairs, side: int) -> Pairs:
+    """Order pairs in tiles of `side` images, so that a cache of twice as many images is seldom missed."""
+    rows = {name: row // side for row, name in enumerate(sorted({name for pair in pairs for name in pair}))}
+    return sorted(pairs, key=lambda pair: (rows[pair[0]], rows[pair[1]], pair))
+
+
+def _within(matches: ImageMatches, mask1: PhotoMask | None, mask2: PhotoMask | None) -> ImageMatches:
+    kept = _unmasked(matches.points2D_1, mask1) & _unmasked(matches.points2D_2, mask2)
+    return ImageMatches(
+        points2D_1=matches.points2D_1[kept],
+        points2D_2=matches.points2D_2[kept],
+        scores=matches.scores[kept],
+    )
+
+
+def _unmasked(points2D: Points2D, mask: PhotoMask | None) -> Mask:
+    if mask is None:
+        return np.ones(len(points2D), dtype=bool)
+    columns, rows = np.clip(points2D.astype(np.int64), 0, np.array(mask.shape[::-1]) - 1).T
+    return mask[rows, columns] > 0
+
+
+_Places = Float64[np.ndarray, "_ 2"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Cells:
+    """The matched cells of one image."""
+
+    points2D: Points2D
+    scores: Float32[np.ndarray, " n"]
+    rows: Mapping[tuple[str, str], Int64[np.ndarray, " _"]]  # cells of each match, by pair
+
+    def features(self, image_size: tuple[int, int]) -> Features:
+        return Features(
+            keypoints=self.points2D.astype(np.float32),
+            descriptors=np.zeros((len(self.points2D), 0), np.float16),
+            scores=self.scores,
+            image_size=image_size,
+        )
+
+    def pairs(self, other: "_Cells", pair: tuple[str, str]) -> IndexPairs:
+        joined = np.stack([self.rows[pair], other.rows[pair]], axis=1)
+        return joined[np.argsort(joined[:, 0])]
+
+
+def _numbered(names: list[str], found: Mapping[tuple[str, str], ImageMatches]) -> dict[str, _Cells]:
+    places: dict[str, dict[tuple[str, str], _Places]] = defaultdict(dict)
+    for (a, b), matches in found.items():
+        places[a][a, b], places[b][a, b] = matches.points2D_1, matches.points2D_2
+    return {name: _number(places[name], found) for name in names}
+
+
+def _number(
+    places: Mapping[tuple[str, str], _Places], found: Mapping[tuple[str, str], ImageMatches]
+) -> _Cells:
+    """Number the cells of one image by decreasing sum of scores, then by position."""
+    joined = np.concatenate([np.zeros((0, 2)), *places.values()])
+    scores = np.concatenate([np.zeros(0, np.float32), *(found[pair].scores for pair in places)])
+    cells, which = np.unique(joined, axis=0, return_inverse=True)
+    totals = np.bincount(which, weights=scores, minlength=len(cells))
+    order = np.argsort(-totals, kind="stable")
+    row_of = np.empty(len(cells), np.int64)
+    row_of[order] = np.arange(len(cells))
+    ends = np.cumsum([len(points2D) for points2D in places.values()])
+    parts = np.split(row_of[which.ravel()], ends[:-1]) if len(ends) else []
+    return _Cells(
+        points2D=cells[order],
+        scores=totals[order].astype(np.float32),
+        rows=dict(zip(places, parts, strict=True)),
+    )

@@ -1,0 +1,1 @@
+"""OnePose: matches query keypoints with map points by graph attention."""

@@ -1,0 +1,1 @@
+"""OnePose++: matches map points with the cells of a query by attention, without keypoints."""
