@@ -11,7 +11,8 @@ from commands import contents, slimsfm
 from slimsfm import execution
 from slimsfm.domination import dominates
 from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute, compute_graph
-from slimsfm.graph.io import load_or_compute_graph, read_given_graph
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.io import read_given_graph
 from slimsfm.mapping.io import read_map, write_map
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from commands import contents, slimsfm
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")

@@ -15,7 +15,7 @@ from slimsfm.features import unit_rows
 from slimsfm.geometry import corner_error
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
-from slimsfm.reduction import ReductionOptions, reduce_map
+from slimsfm.reduction import DominatingSetOptions, reduce_map
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def test_the_paper_by_name(boulder, tmp_path):
     assert done.code == 0, done.err
     map_ = boulder.map
     graph = compute_graph(map_, GraphOptions(edges="localize", candidates="all")).graph
-    expected = reduce_map(map_, graph, ReductionOptions(solver="random")).map
+    expected = reduce_map(map_, graph, DominatingSetOptions(solver="random")).map
     assert list(read_map(tmp_path / "slim").images) == list(expected.images)
 
 

@@ -12,7 +12,7 @@ from slimsfm.evaluation import statistics
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions
-from slimsfm.reduction import ReductionOptions, trial
+from slimsfm.reduction import DominatingSetOptions, trial
 from slimsfm.selection import information, problem
 
 PAGE = " ".join((Path(__file__).parents[2] / "docs" / "method.md").read_text(encoding="utf-8").split())
@@ -32,7 +32,7 @@ def test_the_weights_of_the_confidence_are_those_learned():
     ("words", "value"),
     [
         (r"\tau = {:g}", GraphOptions().threshold),
-        (r"\tau = {:g}", ReductionOptions().threshold),
+        (r"\tau = {:g}", DominatingSetOptions().threshold),
         ("probability that $e < {:g}$", verification.RIGHT),
         (r"c_t \ge {:g}", search._SURE),
         (r"\hat{{e}}_t \le {:g}", search._EXACT),

@@ -10,7 +10,7 @@ from scenes import exact_map
 from slimsfm.features import Features
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.graph.candidates import all_pairs, covisible_pairs, likely_pairs
-from slimsfm.graph.recall import estimate_recall
+from slimsfm.graph.compute import estimate_recall
 
 LIKELY = GraphOptions(edges="localize", candidates="likely")
 ALL = replace(LIKELY, candidates="all")

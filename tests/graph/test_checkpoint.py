@@ -14,9 +14,9 @@ from scenes import ALGORITHM_1, algorithm_1, exact_map
 from slimsfm.errors import OutputError
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.candidates import all_pairs
-from slimsfm.graph.checkpoint import Checkpoint
-from slimsfm.graph.io import load_or_compute_graph
-from slimsfm.graph.key import graph_key
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.io import Checkpoint
+from slimsfm.graph.options import graph_key
 from slimsfm.mapping.io import read_map
 
 KEY = "0123456789abcdef" * 4

@@ -13,7 +13,7 @@ import pytest
 from scenes import ALGORITHM_1, algorithm_1
 from slimsfm.execution import dask_cluster, processes
 from slimsfm.graph import GraphOptions, GraphWork, compute, compute_graph
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import silent

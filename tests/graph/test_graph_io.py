@@ -8,8 +8,9 @@ from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
 from slimsfm.graph import GraphOptions, compute
-from slimsfm.graph.io import load_or_compute_graph, read_given_graph, write_graph
-from slimsfm.graph.key import graph_key
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.io import read_given_graph, write_graph
+from slimsfm.graph.options import graph_key
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.pose import RansacOptions

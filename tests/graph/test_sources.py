@@ -10,10 +10,8 @@ import pytest
 from scenes import exact_map, with_matches
 from slimsfm.errors import InputError
 from slimsfm.graph import EDGE_SOURCES, EdgeSource, GraphOptions, compute_graph
-from slimsfm.graph.hybrid import HybridEdges
-from slimsfm.graph.localize import LocalizeEdges
-from slimsfm.graph.matches import MatchEdges
-from slimsfm.graph.source import edge_source, resolve
+from slimsfm.graph.edge_sources import HybridEdges, LocalizeEdges, MatchEdges
+from slimsfm.graph.options import edge_source, resolve_edges
 from slimsfm.mapping.subset import keep_images
 
 EXACT = 1e-4
@@ -132,11 +130,11 @@ def test_tracks_need_no_matches_and_no_features():
 
 
 def test_auto_is_matches_or_tracks_where_there_are_none(exact):
-    assert resolve(exact, OPTIONS) == "matches"
+    assert resolve_edges(exact, OPTIONS) == "matches"
     assert isinstance(edge_source(exact, OPTIONS), MatchEdges)
     bare = replace(exact, matches={})
-    assert resolve(bare, OPTIONS) == "tracks"
-    assert [resolve(exact, GraphOptions(edges=edges)) for edges in EDGE_SOURCES] == list(EDGE_SOURCES)
+    assert resolve_edges(bare, OPTIONS) == "tracks"
+    assert [resolve_edges(exact, GraphOptions(edges=edges)) for edges in EDGE_SOURCES] == list(EDGE_SOURCES)
     with pytest.raises(InputError, match="no matches; use --edges tracks or localize"):
         edge_source(bare, GraphOptions(edges="matches"))
 

@@ -12,8 +12,9 @@ from slimsfm.features import unit_rows
 from slimsfm.mapping.io import bytes_by_part, write_map
 from slimsfm.mapping.map import check_map
 from slimsfm.mapping.subset import keep_images
-from slimsfm.reduction import USES, FrontierOptions, Maker, frontier, points_seen, try_images
+from slimsfm.reduction import USES, FrontierOptions, frontier, points_seen, try_images
 from slimsfm.selection import SELECTORS
+from slimsfm.synthetic.deception import Maker
 
 BUDGETS = (15, 40)
 FEW = FrontierOptions(uses=USES, budgets=BUDGETS, dominators=(1, 2), rim=(False,))

@@ -11,8 +11,8 @@ from selection.random_problems import problem_of, problems, users
 from slimsfm.geometry import project
 from slimsfm.pose import RansacOptions, estimate_pose
 from slimsfm.selection import information
-from slimsfm.selection.information import _Choice
 from slimsfm.selection.leave_one_out import LeftOut
+from slimsfm.selection.pose_information import InformationChoice
 from slimsfm.selection.problem import PRIOR_SIGMA, corner_errors
 from slimsfm.selection.usable_points import selection_problem
 
@@ -81,7 +81,7 @@ def test_the_more_is_chosen_the_less_a_further_point_tells(problem, data):
 @quick
 @given(problem=problems(), cover=st.integers(1, 12))
 def test_an_image_is_satisfied_with_its_number_of_points_and_its_target(problem, cover):
-    choice = _Choice(problem)
+    choice = InformationChoice(problem)
     choice.extend(cover, problem.num_points)
     chosen, usable = np.array(choice.chosen, np.int64), problem.points_an_image
     assert (users(problem)[:, chosen].sum(axis=1) >= np.minimum(cover, usable)).all()
@@ -92,7 +92,7 @@ def test_an_image_is_satisfied_with_its_number_of_points_and_its_target(problem,
 @quick
 @given(problem=problems(), cover=st.integers(1, 12))
 def test_the_last_point_chosen_was_needed(problem, cover):
-    choice = _Choice(problem)
+    choice = InformationChoice(problem)
     if choice.extend(cover, problem.num_points) == 0:
         return
     without, usable = np.array(choice.chosen[:-1], np.int64), problem.points_an_image

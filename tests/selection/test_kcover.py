@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from selection.random_problems import problem_of, problems, users
 from slimsfm.selection import kcover
-from slimsfm.selection.kcover import KCover
+from slimsfm.selection.baselines import KCover
 from slimsfm.selection.problem import most_cover
 
 quick = settings(deadline=None, max_examples=40)

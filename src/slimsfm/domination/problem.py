@@ -53,12 +53,6 @@ class DominationProblem:
     budget: int | float | None
     """The largest sum of costs, or None."""
 
-    forced_in: tuple[int, ...]
-    """Nodes that are chosen in any case, ascending."""
-
-    forced_out: tuple[int, ...]
-    """Nodes that may not be chosen, ascending; they are still to be dominated."""
-
     groups: csr_array
     """Boolean matrix; at least one node of each row is to be chosen."""
 
@@ -72,8 +66,6 @@ class DominationProblem:
         costs: np.ndarray | None = None,
         dominators: int = 1,
         budget: int | float | None = None,
-        forced_in: Iterable[int] = (),
-        forced_out: Iterable[int] = (),
         groups: Adjacency | None = None,
         errors: Adjacency | None = None,
     ) -> None:
@@ -86,17 +78,13 @@ class DominationProblem:
             "costs": validation.canonical_costs(costs, n),
             "dominators": dominators,
             "budget": budget,
-            "forced_in": validation.canonical_nodes("forced_in", forced_in, n),
-            "forced_out": validation.canonical_nodes("forced_out", forced_out, n),
             "groups": validation.canonical_groups(groups, n),
             "errors": None if errors is None else validation.canonical_errors(errors, closed),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        validation.check_forced(self.forced_in, self.forced_out, self.groups)
-        if budget is not None and not budget >= self.cost(self.forced_in):
-            forced = self.cost(self.forced_in)
-            raise ValueError(f"budget must be at least {forced}, the cost of forced_in, got {budget}")
+        if budget is not None and not budget >= 0:
+            raise ValueError(f"budget must not be negative, got {budget}")
 
     @property
     def num_nodes(self) -> int:
@@ -115,15 +103,12 @@ class DominationProblem:
         The set with indicator x meets requirement i if (A x)_i >= b_i. The first requirements are the nodes',
         the last the groups'. Columns of nodes forced out are empty; b_i is 0 where nothing can be asked for.
         """
-        out = np.zeros(self.num_nodes, dtype=bool)
-        out[list(self.forced_out)] = True
-        allowed = diags_array((~out).astype(np.int64), format="csr", dtype=np.int64)
         identity = diags_array(np.ones(self.num_nodes), format="csr", dtype=np.int64)
-        others = csr_array((self.adjacency.astype(np.int64) - identity).T) @ allowed
+        others = csr_array((self.adjacency.astype(np.int64) - identity).T)
         available = np.asarray(others.sum(axis=1), dtype=np.int64).ravel()
-        needs = np.maximum(np.minimum(self.dominators, available), np.where(out, 0, 1))
-        own = diags_array(np.where(out, 0, needs), format="csr", dtype=np.int64)
-        grouped = csr_array(self.groups.astype(np.int64) @ allowed)
+        needs = np.maximum(np.minimum(self.dominators, available), 1)
+        own = diags_array(needs, format="csr", dtype=np.int64)
+        grouped = csr_array(self.groups.astype(np.int64))
         matrix = csr_array(vstack([others + own, grouped], format="csr"))
         matrix.eliminate_zeros()
         matrix.sort_indices()
@@ -170,9 +155,6 @@ class DominationProblem:
             ValueError: `chosen` has a node that is not in the graph.
         """
         chosen = validation.canonical_nodes("chosen", chosen, self.num_nodes)
-        members = set(chosen)
-        if not members.issuperset(self.forced_in) or not members.isdisjoint(self.forced_out):
-            return False
         if self.budget is None:
             return self.num_unmet(chosen) == 0
         return self.cost(chosen) <= self.budget * (1 + TOLERANCE)

@@ -52,18 +52,10 @@ def canonical_groups(groups: Adjacency | None, num_nodes: int) -> csr_array:
     rows = csr_array(_numbers("groups", groups).astype(bool))
     rows.sum_duplicates()
     rows.eliminate_zeros()
+    empty = np.flatnonzero(np.diff(rows.indptr) == 0)
+    if len(empty):
+        raise ValueError(f"groups must each have a node, got none in {empty.tolist()}")
     return rows
-
-
-def check_forced(forced_in: tuple[int, ...], forced_out: tuple[int, ...], groups: csr_array) -> None:
-    """Refuse nodes forced both ways and groups of which no node may be chosen."""
-    both = sorted(set(forced_in) & set(forced_out))
-    if both:
-        raise ValueError(f"forced_in and forced_out must have no node in common, got {both} in both")
-    rows = np.split(groups.indices, groups.indptr[1:-1])[: len(groups.indptr) - 1]
-    empty = [number for number, row in enumerate(rows) if np.isin(row, forced_out).all()]
-    if empty:
-        raise ValueError(f"groups must each have a node that is not forced out, got none in {empty}")
 
 
 def canonical_errors(errors: Adjacency, adjacency: csr_array) -> csr_array:

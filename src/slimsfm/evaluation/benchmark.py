@@ -14,15 +14,15 @@ from slimsfm.evaluation.results import Cell, MappedObject, ObjectResult, Trial, 
 from slimsfm.evaluation.variants import Making, Variant, parse_variant
 from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import load_or_compute_graph
-from slimsfm.graph.source import Edges
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.options import Edges
 from slimsfm.localization import LocalizationOptions
 from slimsfm.mapping.build import BuildOptions
-from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map, write_map
+from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction import ReductionOptions, dominating_set
+from slimsfm.reduction import DominatingSetOptions, dominating_set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class BenchmarkOptions:
     edges: Edges = "localize"
     """How the reference graph is computed; the paper localizes each image from each other one."""
 
-    reduction: ReductionOptions = ReductionOptions()
+    reduction: DominatingSetOptions = DominatingSetOptions()
     """How dominating sets are chosen."""
 
     def __post_init__(self) -> None:
@@ -145,7 +145,6 @@ def _making(subject: _Subject) -> Making:
         graph=graph,
         reduction=options.reduction,
         solution=dominating_set(graph, options.reduction, full),
-        weigh=weigh_map,
         progress=progress,
     )
 

@@ -17,16 +17,15 @@ from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction import (
     Choice,
+    DominatingSetOptions,
     FrontierOptions,
-    Maker,
-    ReductionOptions,
-    Weigh,
+    apply_choice,
     dominating_set,
     frontier,
     keep_random_images,
     recommend,
 )
-from slimsfm.selection import SELECTORS
+from slimsfm.selection import find_selector
 from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.usable_points import selection_problem
 
@@ -44,14 +43,11 @@ class Making:
     graph: ReferenceGraph
     """Its reference graph."""
 
-    reduction: ReductionOptions
+    reduction: DominatingSetOptions
     """How its dominating set is chosen where a variant does not say otherwise."""
 
     solution: Solution
     """That dominating set."""
-
-    weigh: Weigh
-    """Tells the size of a map."""
 
     progress: ProgressBar = silent
     """Told of long work."""
@@ -120,7 +116,7 @@ def _full(making: Making, _: None) -> list[Map]:
 
 
 def _reduction_settings(words: list[str]) -> dict[str, Any]:
-    """Fields of `ReductionOptions` that differ."""
+    """Fields of `DominatingSetOptions` that differ."""
     settings = {}
     for word in words:
         key, _, value = word.partition("=")
@@ -128,7 +124,7 @@ def _reduction_settings(words: list[str]) -> dict[str, Any]:
         if field in settings:
             raise ValueError(f"{key} is given twice")
         settings[field] = read(value)
-    ReductionOptions(**settings)  # refuses what cannot be
+    DominatingSetOptions(**settings)  # refuses what cannot be
     return settings
 
 
@@ -175,15 +171,14 @@ def _default(making: Making, _: None) -> list[Map]:
     if making.map.info.extractor in DETECTOR_FREE:
         return []
     options = FrontierOptions(uses=("direct",))
-    found = frontier(making.map, None, making.weigh, options, making.progress)
-    return [Maker(making.map).make(recommend(found, "direct").choice)]
+    found = frontier(making.map, options, progress=making.progress)
+    return [apply_choice(making.map, recommend(found, "direct").choice)]
 
 
 def _points_settings(words: list[str]) -> tuple[int, str]:
     count, *rest = words
     (selector,) = rest or [_SELECTOR]
-    if selector not in SELECTORS:
-        raise ValueError(f"selectors are {', '.join(SELECTORS)}")
+    find_selector(selector)
     return _count([count]) or 0, selector
 
 
@@ -192,9 +187,9 @@ def _points(making: Making, settings: tuple[int, str]) -> list[Map]:
         return []
     count, selector = settings
     problem = selection_problem(making.map, LeftOut(making.map), making.progress)
-    points = np.sort(SELECTORS[selector](problem, count, seed=making.reduction.seed))
+    points = np.sort(find_selector(selector)(problem, count, seed=making.reduction.seed))
     choice = Choice(use="direct", method=selector, detail=f"{count} points", images=(), points=points)
-    return [Maker(making.map).make(choice)]
+    return [apply_choice(making.map, choice)]
 
 
 VARIANTS = {

@@ -7,13 +7,19 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from slimsfm.domination.cover import Cover, components, cover_of, split
-from slimsfm.domination.greedy import LARGE, greedy, greedy_parts, part_bound
-from slimsfm.domination.presolve import reduced
+from slimsfm.domination.cover import Cover, components, cover_of, presolve, split
+from slimsfm.domination.greedy_cover import LARGE, greedy, greedy_parts, part_bound
+from slimsfm.domination.milp import (
+    Minimizer,
+    Minimum,
+    Program,
+    StagedProgram,
+    covering_program,
+    error_program,
+    staged_program,
+)
 from slimsfm.domination.problem import DominationProblem
-from slimsfm.domination.program import Minimizer, Minimum, Program, covering_program
 from slimsfm.domination.solution import Bounds, Solution, merit, rounded_up, solution_of
-from slimsfm.domination.staged import StagedProgram, error_program, staged_program
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,10 +85,10 @@ def solve_in_stages(
 
 def _cheapest(search: _Search) -> tuple[tuple[int, ...], Bounds]:
     problem = search.problem
-    kernel = reduced(cover_of(problem))
-    picked = [*problem.forced_in, *kernel.chosen]
+    presolved = presolve(cover_of(problem))
+    picked = list(presolved.chosen)
     bound = problem.cost(picked)
-    pieces = sorted(split(kernel.cover), key=lambda piece: piece.matrix.nnz)
+    pieces = sorted(split(presolved.cover), key=lambda piece: piece.matrix.nnz)
     hints = greedy_parts(pieces, seed=search.seed, effort=search.effort)
     for piece, hint in zip(pieces, hints, strict=True):
         part, least = _cheapest_part(search, piece, hint)
@@ -119,10 +125,10 @@ def _most_met(search: _Search) -> tuple[tuple[int, ...], Bounds]:
     chosen, least = _improved(search, staged, staged.program.aiming_at(staged.unmet), known)
     unmet_bound = max(0, rounded_up(least + len(staged.rows)))
     if problem.num_unmet(chosen) > unmet_bound:
-        return chosen, Bounds(unmet=unmet_bound, cost=problem.cost(problem.forced_in))
+        return chosen, Bounds(unmet=unmet_bound)
     held = staged.program.aiming_at(staged.unmet).holding(unmet_bound - len(staged.rows))
     chosen, least = _improved(search, staged, held.aiming_at(staged.cost), chosen)
-    return chosen, Bounds(unmet=unmet_bound, cost=max(least, problem.cost(problem.forced_in)))
+    return chosen, Bounds(unmet=unmet_bound, cost=max(least, 0))
 
 
 def _least_error(

@@ -1,13 +1,85 @@
-"""The integer program of all that a problem asks for, aim by aim."""
+"""Integer programs for covers and for all aims of a problem, to be minimized by any solver."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array, hstack, vstack
+from scipy.sparse import block_array, csr_array, diags_array, hstack, vstack
 
-from slimsfm.domination.cover import Columns, Rows
+from slimsfm.domination.cover import Columns, Cover, Rows
 from slimsfm.domination.problem import TOLERANCE, DominationProblem
-from slimsfm.domination.program import Program
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Program:
+    """Minimize c x over 0-1 vectors x between two others, with A x >= b."""
+
+    objective: np.ndarray
+    """c."""
+
+    matrix: csr_array
+    """A."""
+
+    lower: np.ndarray
+    """b."""
+
+    least: np.ndarray
+    """Least value of each variable, 0 or 1."""
+
+    most: np.ndarray
+    """Largest value of each variable, 0 or 1."""
+
+    def aiming_at(self, objective: np.ndarray) -> "Program":
+        """The program with another objective."""
+        return replace(self, objective=objective)
+
+    def holding(self, value: int | float) -> "Program":
+        """The program with its objective held at a value or below."""
+        limit = value + TOLERANCE * max(1.0, abs(value))
+        row = csr_array(-self.objective[None])
+        return replace(
+            self,
+            matrix=csr_array(vstack([self.matrix, row], format="csr")),
+            lower=np.append(self.lower, -limit),
+        )
+
+    def extended(self, old: csr_array, new: csr_array, lower: np.ndarray, costs: np.ndarray) -> "Program":
+        """The program with more variables, of given costs, and the constraints old x + new y >= lower."""
+        count = len(costs)
+        return Program(
+            objective=np.concatenate([self.objective, costs]),
+            matrix=csr_array(block_array([[self.matrix, None], [old, new]], format="csr")),
+            lower=np.concatenate([self.lower, lower]),
+            least=np.concatenate([self.least, np.zeros(count)]),
+            most=np.concatenate([self.most, np.ones(count)]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Minimum:
+    """What a search for a program's minimum ended with."""
+
+    values: np.ndarray | None
+    """The best variables found, or None."""
+
+    bound: int | float
+    """No feasible vector has a smaller objective."""
+
+
+Minimizer = Callable[[Program, np.ndarray, float], Minimum]
+"""Minimizes a program, given what is known of a good vector's first variables, in so many seconds at most."""
+
+
+def covering_program(cover: Cover) -> Program:
+    """The cheapest choice for a cover without a budget; one variable for each of its candidates."""
+    columns = cover.candidates
+    return Program(
+        objective=cover.costs[columns],
+        matrix=csr_array(cover.matrix[:, columns], dtype=np.float64),
+        lower=cover.needs.astype(np.float64),
+        least=np.zeros(len(columns)),
+        most=np.ones(len(columns)),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,8 +128,8 @@ def staged_program(problem: DominationProblem, rows: Rows) -> StagedProgram:
             objective=np.zeros(count),
             matrix=of_nodes,
             lower=lower,
-            least=np.append(np.isin(nodes, problem.forced_in).astype(np.float64), np.zeros(num_met)),
-            most=np.append(~np.isin(nodes, problem.forced_out), np.ones(num_met)).astype(np.float64),
+            least=np.zeros(count),
+            most=np.ones(count),
         ),
         unmet=np.append(np.zeros(len(nodes)), -np.ones(num_met)),
         cost=np.append(costs, np.zeros(num_met)),
@@ -77,7 +149,7 @@ def error_program(
     """
     targets = staged.rows[staged.rows < problem.num_nodes]
     edges = csr_array(errors.T)[targets].tocoo()
-    kept = (edges.col != targets[edges.row]) & ~np.isin(edges.col, problem.forced_out)
+    kept = edges.col != targets[edges.row]
     u, row, costs = edges.col[kept], edges.row[kept], edges.data[kept]
     old, count, number = len(program.objective), len(costs), np.arange(len(targets))
     own = _entries(number, np.searchsorted(staged.nodes, targets), (len(targets), old))

@@ -54,11 +54,11 @@ def information(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
     """
     check_count(count)
     covers = _covers(problem)
-    choice = _Choice(problem)
+    choice = InformationChoice(problem)
     low, high = 0, max(bisect_right(covers, most_cover(problem, count)) - 1, 0)
     while low < high:
         middle = (low + high + 1) // 2
-        tried = _Choice(problem)
+        tried = InformationChoice(problem)
         if tried.extend(covers[middle], count + 1) <= count:
             low, choice = middle, tried
         else:
@@ -78,7 +78,7 @@ def _covers(problem: SelectionProblem) -> list[int]:
     return covers
 
 
-class _Choice:
+class InformationChoice:
     """The points chosen so far and what they do for each image."""
 
     def __init__(self, problem: SelectionProblem) -> None:

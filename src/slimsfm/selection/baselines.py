@@ -1,8 +1,4 @@
-"""K-cover [1]: every image uses at least K of the chosen points.
-
-References:
-    [1] Li, Snavely and Huttenlocher, Location Recognition using Prioritized Feature Matching, ECCV 2010.
-"""
+"""K-cover and points at random."""
 
 from collections.abc import Iterator
 
@@ -96,3 +92,22 @@ class KCover:
 
     def _now(self, points: Ids) -> Gains:
         return self._gains[points]
+
+
+def random_points(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
+    """Draw points uniformly, without replacement, from those that any image can use.
+
+    Args:
+        problem: The points and who can use them.
+        count: How many points are wanted.
+        seed: Equal problems and seeds give equal points; a smaller count gives a beginning of them.
+
+    Returns:
+        Points in the order of the draw.
+
+    Raises:
+        ValueError: `count` is not positive.
+    """
+    check_count(count)
+    usable = np.flatnonzero(np.diff(problem.images_of.starts))
+    return np.random.default_rng(seed).permutation(usable)[:count]

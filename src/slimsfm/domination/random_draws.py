@@ -49,8 +49,7 @@ def random_greedy(problem: DominationProblem, *, draws: int = 1000, seed: int = 
         best = min(sets, key=lambda chosen: float(problem.costs[chosen].sum()))
     else:
         best = min(sets, key=lambda chosen: merit(problem, tuple(sorted(chosen))))
-    bound = problem.cost(problem.forced_in)
-    bound += dual_bound(drawn.cover) if problem.budget is None else 0
+    bound = dual_bound(drawn.cover) if problem.budget is None else 0
     return solution_of(problem, tuple(sorted(best)), Bounds(cost=bound), start)
 
 
@@ -69,7 +68,7 @@ class _Draws:
     def draw(self, rng: np.random.Generator) -> list[int]:
         """Walk through a random order: its next remaining node is a uniform choice of the remaining ones."""
         residual = self.cover.needs.copy()
-        chosen = list(self.problem.forced_in)
+        chosen: list[int] = []
         left = self.cover.budget * (1 + 1e-12)
         for row in rng.permutation(len(residual)).tolist():
             if residual[row] <= 0:
@@ -90,10 +89,7 @@ class _Draws:
 
 def _own_nodes(problem: DominationProblem) -> Ids:
     """The node of each row of the problem's cover; -1 for nodes forced out and for groups."""
-    matrix, needs = problem.requirements
+    _, needs = problem.requirements
     nodes = np.full(len(needs), -1, dtype=np.int64)
     nodes[: problem.num_nodes] = np.arange(problem.num_nodes)
-    nodes[list(problem.forced_out)] = -1
-    indicator = np.zeros(problem.num_nodes, dtype=np.int64)
-    indicator[list(problem.forced_in)] = 1
-    return nodes[needs - matrix @ indicator > 0]
+    return nodes[needs > 0]
