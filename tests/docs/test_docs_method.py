@@ -12,7 +12,7 @@ from slimsfm.evaluation import statistics
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions
-from slimsfm.reduction import DominatingSetOptions, trial
+from slimsfm.reduction import DominatingSetOptions, forecast
 from slimsfm.selection import information, problem
 
 PAGE = " ".join((Path(__file__).parents[2] / "docs" / "method.md").read_text(encoding="utf-8").split())
@@ -42,7 +42,7 @@ def test_the_weights_of_the_confidence_are_those_learned():
         (r"\sigma_0 = {:g}", problem.PRIOR_SIGMA),
         ("anew, with replacement, {:g} times", statistics._RESAMPLES),
         ("the smallest of {:g} |", default(random_greedy, "draws")),
-        ("Up to {:g} references", trial._MOST_TESTS),
+        ("Up to {:g} references", forecast._MOST_TESTS),
     ],
 )
 def test_a_number_is_the_code_s(words, value):

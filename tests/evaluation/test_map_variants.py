@@ -6,7 +6,6 @@ import pytest
 from scenes import algorithm_1, exact_map
 from slimsfm.domination import dominates
 from slimsfm.evaluation.variants import VARIANTS, Making, parse_variant
-from slimsfm.mapping.io import weigh_map
 from slimsfm.reduction import DominatingSetOptions, dominating_set, keep_random_images
 
 
@@ -24,7 +23,6 @@ def making(narrow):
         graph=graph,
         reduction=reduction,
         solution=dominating_set(graph, reduction, narrow),
-        weigh=weigh_map,
     )
 
 

@@ -26,7 +26,7 @@ class ReduceArguments:
     an option below chooses images, else direct. With both, limits hold for each part."""
 
     selector: str | None = None
-    """Selector of the points: information, kcover or random. By default information and kcover are compared."""
+    """Selector of the points: information, kcover or random. By default the first two are compared."""
 
     limits: Annotated[LimitArguments, Flat] = LimitArguments()
     """Limits of the reduced map."""

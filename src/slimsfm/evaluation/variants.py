@@ -25,7 +25,7 @@ from slimsfm.reduction import (
     keep_random_images,
     recommend,
 )
-from slimsfm.selection import find_selector
+from slimsfm.selection import SELECTORS, current_selector
 from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.usable_points import selection_problem
 
@@ -178,8 +178,7 @@ def _default(making: Making, _: None) -> list[Map]:
 def _points_settings(words: list[str]) -> tuple[int, str]:
     count, *rest = words
     (selector,) = rest or [_SELECTOR]
-    find_selector(selector)
-    return _count([count]) or 0, selector
+    return _count([count]) or 0, current_selector(selector)
 
 
 def _points(making: Making, settings: tuple[int, str]) -> list[Map]:
@@ -187,7 +186,7 @@ def _points(making: Making, settings: tuple[int, str]) -> list[Map]:
         return []
     count, selector = settings
     problem = selection_problem(making.map, LeftOut(making.map), making.progress)
-    points = np.sort(find_selector(selector)(problem, count, seed=making.reduction.seed))
+    points = np.sort(SELECTORS[selector](problem, count, seed=making.reduction.seed))
     choice = Choice(use="direct", method=selector, detail=f"{count} points", images=(), points=points)
     return [apply_choice(making.map, choice)]
 

@@ -36,7 +36,7 @@ class ReductionLimits:
                 raise ValueError(f"{name} must not be negative, got {value}")
 
     @property
-    def given(self) -> dict[str, float]:
+    def given(self) -> dict[str, int | float]:
         """The limits that are set, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
@@ -98,15 +98,15 @@ def _is_usable(choice: Choice, use: str) -> bool:
     return choice.use == use and (use, choice.method) != ("direct", DOMINATING)
 
 
-def _weights(choice: Choice, size: int) -> dict[str, float]:
+def _weights(choice: Choice, size: int) -> dict[str, int | float]:
     return {"max_bytes": size, "max_points": len(choice.points), "max_images": len(choice.images)}
 
 
-def _figures(one: Candidate) -> dict[str, float]:
+def _figures(one: Candidate) -> dict[str, int | float]:
     return {**_weights(one.choice, one.bytes), "max_loss": one.loss, "max_ms": 1e3 * one.seconds}
 
 
-def _excess(figures: dict[str, float], limits: ReductionLimits) -> float:
+def _excess(figures: dict[str, int | float], limits: ReductionLimits) -> float:
     """By how much figures exceed the limits, the worst one counted: 0 or less where all limits are met."""
     excesses = [0.0]
     for name, limit in limits.given.items():

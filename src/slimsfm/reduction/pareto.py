@@ -18,7 +18,7 @@ from slimsfm.reduction.choice import DOMINATING, Candidate, Choice, Frontier, ap
 from slimsfm.reduction.forecast import Trials
 from slimsfm.reduction.image_sets import DominatingSetOptions, dominating_set
 from slimsfm.reduction.limits import ReductionLimits, check_reachable
-from slimsfm.selection import REPLACED_SELECTORS, SELECTORS, find_selector
+from slimsfm.selection import REPLACED_SELECTORS, SELECTORS, current_selector
 from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem
 from slimsfm.selection.usable_points import selection_problem
@@ -193,9 +193,9 @@ def _choices(
 
 
 def _point_choices(problem: SelectionProblem, selector: str, options: FrontierOptions) -> Iterator[Choice]:
-    method = REPLACED_SELECTORS.get(selector, selector)
+    method = current_selector(selector)
     for budget in sorted(set(options.budgets)):
-        points = np.sort(find_selector(selector)(problem, budget, seed=options.seed))
+        points = np.sort(SELECTORS[method](problem, budget, seed=options.seed))
         if len(points):
             yield Choice(
                 use="direct", method=method, detail=f"{len(points)} points", images=(), points=points

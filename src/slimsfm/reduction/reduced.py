@@ -35,7 +35,7 @@ from slimsfm.reduction.pareto import (
     forecast_images,
     frontier,
 )
-from slimsfm.selection import REPLACED_SELECTORS, find_selector
+from slimsfm.selection import REPLACED_SELECTORS, current_selector
 
 Use = Literal["direct", "images", "both"]
 
@@ -134,7 +134,7 @@ class ReduceOptions:
         if self.for_ is not None and self.for_ not in get_args(Use):
             raise ValueError(f"for_ must be one of {', '.join(get_args(Use))}, got {self.for_!r}")
         if self.selector is not None:
-            find_selector(self.selector)
+            current_selector(self.selector)
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
         self._check_uses()

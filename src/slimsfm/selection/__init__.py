@@ -14,8 +14,8 @@ REPLACED_SELECTORS = {"probabilistic": "kcover"}
 """Names of removed selectors that are still accepted, and the selectors that are used instead."""
 
 
-def find_selector(name: str) -> Selector:
-    """Return the selector of a name, or the selector that replaces a removed one.
+def current_selector(name: str) -> str:
+    """Return the name of a selector, or that of the selector which replaces a removed one.
 
     Raises:
         ValueError: There is no selector of this name.
@@ -23,7 +23,7 @@ def find_selector(name: str) -> Selector:
     current = REPLACED_SELECTORS.get(name, name)
     if current not in SELECTORS:
         raise ValueError(f"selector must be one of {', '.join(SELECTORS)}, got {name!r}")
-    return SELECTORS[current]
+    return current
 
 
 __all__ = [
@@ -32,7 +32,7 @@ __all__ = [
     "ImagesOfPoints",
     "SelectionProblem",
     "Selector",
-    "find_selector",
+    "current_selector",
     "information",
     "kcover",
     "random_points",
