@@ -114,9 +114,10 @@ def test_an_interrupted_command_keeps_what_it_would_have_replaced(boulder, start
 
 
 SMALL_BLOCKS = """
-from slimsfm.graph import compute
-compute._BLOCK_SECONDS, compute._WORTH_SECONDS = 0.02, 0.0
-from slimsfm.cli import main
+from functools import partial
+from slimsfm.cli import graph_command, main
+find = graph_command.load_or_compute_graph
+graph_command.load_or_compute_graph = partial(find, block_seconds=0.02, min_seconds=0.0)
 main()
 """
 

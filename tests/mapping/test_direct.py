@@ -173,7 +173,7 @@ def test_what_is_kept_of_a_map_for_both_is_for_images_again(partial):
         ),
         lambda map_: Localizer(map_, LocalizationOptions(strategy="exhaustive")),
         lambda map_: keep_images(map_, list(map_.images)[:2]),
-        lambda map_: frontier(map_, None, lambda _: 0, FrontierOptions(uses=("direct",))),
+        lambda map_: frontier(map_, FrontierOptions(uses=("direct",))),
     ],
     ids=["auto", *EDGE_SOURCES, "exhaustive", "keep_images", "frontier"],
 )

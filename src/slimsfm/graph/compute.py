@@ -104,6 +104,7 @@ def load_or_compute_graph(
     progress: ProgressBar = silent,
     *,
     block_seconds: float = GraphWork.block_seconds,
+    min_seconds: float = GraphWork.min_seconds,
 ) -> GraphRun:
     """Read the reference graph of a map from a folder, or compute it and write it there.
 
@@ -115,7 +116,8 @@ def load_or_compute_graph(
         options: How edges are found.
         open_executor: Opens the executor for blocks of pairs; None: this process.
         progress: Progress callback.
-        block_seconds: Expected duration of a block; progress is kept after each block.
+        block_seconds: As in `GraphWork`.
+        min_seconds: As in `GraphWork`.
     """
     start, folder = perf_counter(), Path(folder)
     key = graph_key(map, options)
@@ -123,7 +125,12 @@ def load_or_compute_graph(
     run = read_kept_graph(path, key, start)
     if run is not None:
         return run
-    work = GraphWork(map_path=folder, open_executor=open_executor, block_seconds=block_seconds)
+    work = GraphWork(
+        map_path=folder,
+        open_executor=open_executor,
+        block_seconds=block_seconds,
+        min_seconds=min_seconds,
+    )
     if not os.access(folder, os.W_OK):
         return compute_graph(map, options, work, progress)
     checkpoint = path.with_suffix(".partial")
