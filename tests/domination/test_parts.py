@@ -63,7 +63,7 @@ def test_integer_costs_give_integer_sums():
 @pytest.mark.parametrize(
     ("given_parts", "message"),
     [
-        ({"costs": np.ones(2)}, r"costs must be one a node, of shape \(3,\), got shape \(2,\)"),
+        ({"costs": np.ones(2)}, r"costs must be one per node, of shape \(3,\), got shape \(2,\)"),
         ({"costs": np.array([1, 0, 1])}, "costs must be positive and finite, got 0.0"),
         ({"costs": np.array([1, np.nan, 1])}, "costs must be positive and finite, got nan"),
         ({"dominators": 0}, "dominators must be at least 1, got 0"),

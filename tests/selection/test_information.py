@@ -83,7 +83,7 @@ def test_the_more_is_chosen_the_less_a_further_point_tells(problem, data):
 def test_an_image_is_satisfied_with_its_number_of_points_and_its_target(problem, cover):
     choice = InformationChoice(problem)
     choice.extend(cover, problem.num_points)
-    chosen, usable = np.array(choice.chosen, np.int64), problem.points_an_image
+    chosen, usable = np.array(choice.chosen, np.int64), problem.points_per_image
     assert (users(problem)[:, chosen].sum(axis=1) >= np.minimum(cover, usable)).all()
     target = problem.best_corner_errors * np.sqrt(np.maximum(usable / cover, 1))
     assert (problem.corner_errors(chosen) <= target * (1 + 1e-5)).all()
@@ -95,7 +95,7 @@ def test_the_last_point_chosen_was_needed(problem, cover):
     choice = InformationChoice(problem)
     if choice.extend(cover, problem.num_points) == 0:
         return
-    without, usable = np.array(choice.chosen[:-1], np.int64), problem.points_an_image
+    without, usable = np.array(choice.chosen[:-1], np.int64), problem.points_per_image
     few = users(problem)[:, without].sum(axis=1) < np.minimum(cover, usable)
     target = problem.best_corner_errors * np.sqrt(np.maximum(usable / cover, 1))
     assert (few | (problem.corner_errors(without) > target)).any()

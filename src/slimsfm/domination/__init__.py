@@ -1,4 +1,4 @@
-"""Minimum dominating sets of directed graphs: pure graph theory, which knows of no images."""
+"""Minimum dominating sets of directed graphs: pure graph theory, independent of images."""
 
 from slimsfm.domination.exact_solvers import cpsat, exact
 from slimsfm.domination.greedy_cover import cover_order, greedy

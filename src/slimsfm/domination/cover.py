@@ -1,4 +1,4 @@
-"""What is left of a problem once it is stated as a covering problem, and its data reduction."""
+"""The covering problem that a domination problem states, and its data reduction."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,28 +11,28 @@ from scipy.sparse.csgraph import connected_components
 from slimsfm.domination.problem import DominationProblem
 
 Rows = Int64[np.ndarray, " rows"]
-"""Something of each row, or numbers of some rows."""
+"""One value per row, or indices of rows."""
 
 Columns = Int64[np.ndarray, " columns"]
-"""Numbers of some columns."""
+"""Indices of columns."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cover:
-    """Choose columns of a matrix A of whole numbers so that each row i sums to its need b_i or more.
+    """Choose columns of an integer matrix A so that each row i sums to its need b_i or more.
 
-    Columns are the nodes of a problem, under their own numbers; those that may not be chosen, or need not be
-    considered, are empty. No entry exceeds its row's need.
+    Columns are the nodes of a problem, with the same indices; columns that need not be considered are empty.
+    No entry exceeds its row's need.
     """
 
     matrix: csr_array
-    """A, one row for each requirement that is not met yet."""
+    """A, with one row per unmet requirement."""
 
     needs: Rows
     """b, positive."""
 
     costs: np.ndarray
-    """Positive, one a column."""
+    """Positive, one per column."""
 
     budget: int | float = np.inf
     """The largest sum of costs."""
@@ -55,13 +55,13 @@ class Cover:
         return self.columns.indices[part], self.columns.data[part]
 
     def covered(self, chosen: list[int]) -> Rows:
-        """What chosen columns sum to in each row."""
+        """The sum of the chosen columns in each row."""
         indicator = np.zeros(len(self.costs), dtype=np.int64)
         indicator[chosen] = 1
         return np.asarray(self.matrix @ indicator, dtype=np.int64)
 
     def after(self, chosen: list[int], without: np.ndarray) -> "Cover":
-        """The cover that is left when columns are chosen and others (a mask) are given up."""
+        """The remaining cover when columns are chosen and others (a mask) are removed."""
         needs = self.needs - self.covered(chosen)
         gone = without.copy()
         gone[chosen] = True
@@ -71,7 +71,7 @@ class Cover:
 def open_cover(
     matrix: csr_array, needs: Rows, costs: np.ndarray, gone: np.ndarray, budget: int | float = np.inf
 ) -> Cover:
-    """A cover of the rows that need something, without the columns that are gone (a mask)."""
+    """Create the cover of the rows with positive needs, without the columns that are gone (a mask)."""
     open_rows = np.flatnonzero(needs > 0)
     part = csr_array(matrix[open_rows], dtype=np.int64)
     left = needs[open_rows]
@@ -103,7 +103,7 @@ def components(matrix: csr_array) -> list[Rows]:
 
 
 def split(cover: Cover) -> list[Cover]:
-    """Covers without a common row or column, which can be solved apart; the cover must have no budget."""
+    """Split a cover without a budget into covers without common rows or columns, to solve separately."""
     return [
         Cover(matrix=csr_array(cover.matrix[rows]), needs=cover.needs[rows], costs=cover.costs)
         for rows in components(cover.matrix)
@@ -113,9 +113,9 @@ def split(cover: Cover) -> list[Cover]:
 def dual_bound(cover: Cover) -> int | float:
     """A cost below which no choice of columns meets all rows: that of a packing of the rows.
 
-    Any prices y >= 0 of the rows, such that no column's rows are priced above its cost, prove sum(b y): weak
-    duality of linear programming. Each row's price starts at the least share of a column's cost among the
-    column's entries, then rises as far as it can, rows with the lowest prices first.
+    Any prices y >= 0 of the rows such that no column's rows are priced above its cost prove the bound
+    sum(b y), by weak duality of linear programming. Each row's price starts at the least share of a column's
+    cost among the column's entries, then rises as far as possible, rows with the lowest prices first.
     """
     if cover.matrix.nnz == 0:
         return 0.0
@@ -132,15 +132,15 @@ def dual_bound(cover: Cover) -> int | float:
     return float(cover.needs @ prices)
 
 
-_MOST_PRODUCTS = 20_000_000  # multiplications for which comparing all pairs of rows or columns is worth it
+_MOST_PRODUCTS = 20_000_000  # largest number of multiplications for comparing all pairs of rows or columns
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Presolved:
-    """A reduced cover, and the columns that belong to a cheapest choice for the one it came from."""
+    """A reduced cover, and columns that belong to a cheapest choice for the original cover."""
 
     cover: Cover
-    """A cheapest choice for it, with `chosen`, is a cheapest one for the cover that was reduced."""
+    """A cheapest choice for it, together with `chosen`, is a cheapest choice for the original cover."""
 
     chosen: list[int]
     """Columns without which no choice meets all rows, in the order found."""
@@ -150,10 +150,10 @@ def presolve(cover: Cover) -> Presolved:
     """Reduce a cover without a budget until nothing changes [1].
 
     - A column without which its row's need cannot be met is chosen.
-    - A column is given up if another one, at no greater cost, alone meets all rows that it has entries in.
-    - A row that needs one is dropped if it has all columns of another row: who meets that meets it.
+    - A column is removed if another one, at no greater cost, alone meets all rows in which it has entries.
+    - A row with need 1 is removed if it has all columns of another row: meeting that row meets it.
 
-    A cover whose rows and columns have too many in common to compare is only searched for the first.
+    Only the first rule is applied to covers with too many pairs of rows or columns to compare.
 
     References:
         [1] Weihe, Covering trains by stations or the power of data reduction, ALEX 1998.
@@ -181,7 +181,7 @@ def _indispensable(cover: Cover) -> list[int]:
 
 
 def _beaten_columns(cover: Cover) -> np.ndarray:
-    """A mask of the columns that another one replaces; of several equal ones the first stays."""
+    """A mask of the columns that another column replaces; the first of equal columns stays."""
     beaten = np.zeros(len(cover.costs), dtype=bool)
     of_entry = np.repeat(np.arange(len(cover.needs)), np.diff(cover.matrix.indptr))
     any_entry = _pattern(cover.matrix, np.ones(cover.matrix.nnz, dtype=bool))
@@ -201,7 +201,7 @@ def _beaten_columns(cover: Cover) -> np.ndarray:
 
 
 def _implied_rows(cover: Cover) -> np.ndarray:
-    """A mask of the rows that another one implies; of several equal ones the first stays."""
+    """A mask of the rows that another row implies; the first of equal rows stays."""
     implied = np.zeros(len(cover.needs), dtype=bool)
     pattern = _pattern(cover.matrix, np.ones(cover.matrix.nnz, dtype=bool))
     sizes = np.diff(pattern.indptr)

@@ -21,22 +21,22 @@ _EFFORT = 6  # times the swaps of `greedy`
 def exact(problem: DominationProblem, *, time_limit_s: float = 60.0, seed: int = 0) -> Solution:
     """Find a best dominating set of a directed graph and prove that none is better.
 
-    A covering program: minimize the cost of binary x such that each node's requirement, a linear inequality,
-    is met. Data reduction and the split into components come first; HiGHS [2] solves what is left by branch
-    and cut. With a budget or errors there are further programs, one for each aim, with the earlier aims held;
-    the one for the errors is that of the p-median problem. The problem is NP-hard; view graphs [1] of some
-    hundred images take seconds.
+    A covering program: minimize the cost of binary x such that the requirement of each node, a linear
+    inequality, is met. After data reduction and the split into components, HiGHS [2] solves the rest by
+    branch and cut. With a budget or errors there is one program per objective, with the earlier objectives as
+    constraints; the program of the errors is that of the p-median problem. The problem is NP-hard; view
+    graphs [1] of some hundred images take seconds.
 
     Args:
-        problem: What to meet.
-        time_limit_s: Seconds after which the search ends with the best set so far. What precedes the
-            programs, `greedy` included, takes part of it, but is not cut off.
+        problem: The graph and its requirements.
+        time_limit_s: Seconds after which the search ends with the best set so far. The steps before the
+            programs, such as `greedy`, count toward it, but are not interrupted.
         seed: Seed of `greedy`, from whose set the search starts.
 
     Returns:
-        A best set (`is_optimal`), up to 1e-6 in sums of costs or errors that are not whole numbers; or, if
-        the time is up, one that is no worse than `greedy`'s, with the search's bounds. Which of several best
-        sets it is, HiGHS settles, a deterministic search; only one that the clock cuts off is not repeatable.
+        A best set (`is_optimal`), up to 1e-6 in sums of costs or errors that are not integers; or, if the
+        time is up, a set that is not worse than that of `greedy`, with the bounds of the search. The search
+        is deterministic unless the time limit ends it.
 
     Raises:
         ValueError: `time_limit_s` is not positive.
@@ -69,19 +69,19 @@ def cpsat(problem: DominationProblem, *, time_limit_s: float = 60.0, seed: int =
     """Find a best dominating set of a directed graph, or a good one of a large graph, with a bound.
 
     The programs of `exact`, solved by CP-SAT [1]: clause learning with a linear relaxation. It starts from
-    the set that `greedy` finds, with several times its swaps where a component is large. One worker with the
-    relaxation at its strongest proves more than several without it.
+    the set of `greedy`, with several times as many swaps for large components. One worker with the strongest
+    relaxation proves more than several workers without it.
 
     Args:
-        problem: What to meet.
-        time_limit_s: Seconds after which the search ends with the best set so far. What precedes the
-            programs, the swaps included, takes part of it, but is not cut off.
+        problem: The graph and its requirements.
+        time_limit_s: Seconds after which the search ends with the best set so far. The steps before the
+            programs, such as the swaps, count toward it, but are not interrupted.
         seed: Seed of the swaps and of CP-SAT.
 
     Returns:
-        A best set (`is_optimal`); or, if the time is up, one that is no worse than `greedy`'s, with the
-        search's bounds. Costs and errors that are not whole are rounded to a part in 10^12 of the largest.
-        Equal problems and seeds give equal solutions unless the clock cuts the search off.
+        A best set (`is_optimal`); or, if the time is up, a set that is not worse than that of `greedy`, with
+        the bounds of the search. Costs and errors that are not integers are rounded to a part in 10^12 of the
+        largest. Equal problems and seeds give equal solutions unless the time limit ends the search.
 
     Raises:
         ValueError: `time_limit_s` is not positive.
@@ -91,7 +91,7 @@ def cpsat(problem: DominationProblem, *, time_limit_s: float = 60.0, seed: int =
         [1] Perron, Didier and Gay, The CP-SAT-LP solver, CP 2023.
     """
     try:
-        import ortools.sat.python.cp_model  # noqa: F401 - an extra: looked for before any work is done
+        import ortools.sat.python.cp_model  # noqa: F401 - an extra: checked before any work is done
     except ImportError as error:
         raise InputError(
             "The solver cpsat needs OR-Tools, which is not installed: pip install 'slimsfm[cpsat]'"
@@ -150,7 +150,7 @@ def _constrain(model: "cp_model.CpModel", variables: list, program: Program) -> 
 
 
 def _scale(values: np.ndarray) -> float:
-    """A power of two that makes values whole, or, where none of moderate size does, makes them large."""
+    """A power of two that makes values integers or, if no moderate one does, large."""
     largest = np.abs(values).max(initial=1.0)
     scale = 1.0
     while np.any(values * scale != np.floor(values * scale)) and largest * scale < _LARGEST:

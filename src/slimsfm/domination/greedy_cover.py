@@ -19,17 +19,17 @@ def lazy_greedy(
 ) -> Iterator[int]:
     """Pick the column that adds the most for its cost, again and again, until none adds anything.
 
-    What a column adds to a row is capped at what the row still lacks. That only shrinks with each pick, so a
-    stale value is an upper bound, and only the head of a heap is evaluated again [1].
+    The value that a column adds to a row is capped at what the row still lacks. It only shrinks with each
+    pick, so a stale value is an upper bound, and only the head of a heap is evaluated again [1].
 
     Args:
         cover: The columns and their costs.
-        residual: What each row lacks; changed with each pick.
+        residual: What each row lacks; updated with each pick.
         candidates: The columns to pick from.
-        budget: The largest sum of costs; a column that no longer fits is passed over.
+        budget: The largest sum of costs; a column that no longer fits is skipped.
 
     Yields:
-        Columns; of equally good ones the one with the smallest number.
+        Columns; the lowest index among equally good ones.
 
     References:
         [1] Minoux, Accelerated greedy algorithms for maximizing submodular set functions, 1978.
@@ -66,7 +66,7 @@ def _first_heap(cover: Cover, residual: Rows, candidates: Columns) -> list[tuple
 
 
 def without_redundant(cover: Cover, chosen: list[int]) -> list[int]:
-    """Leave out columns without which no row that is met would not be: the dearest first, then the last."""
+    """Remove columns that no row needs, the most expensive first, then the last chosen."""
     covered = cover.covered(chosen)
     kept = set(chosen)
     order = sorted(range(len(chosen)), key=lambda i: (-cover.costs[chosen[i]], -i))
@@ -80,20 +80,20 @@ def without_redundant(cover: Cover, chosen: list[int]) -> list[int]:
 
 
 LARGE = 1000
-"""A cover of more rows is large: worth another search than small ones, which are soon solved."""
+"""Number of rows above which a cover is large: it is searched longer, and its relaxation is solved."""
 
-_MOST_STEPS = 30_000  # of all pieces together
+_MOST_STEPS = 30_000  # for all pieces together
 _STEPS_PER_ROW = 20
-_ENTRIES = 40_000_000  # of the matrix, to be looked at by all steps together
+_ENTRIES = 40_000_000  # of the matrix, evaluated by all steps together
 
 
 def greedy(problem: DominationProblem, *, seed: int = 0) -> Solution:
     """Find a small dominating set fast: greedily, then by local search.
 
-    Without a budget the problem is reduced first, and its components are solved apart. Nodes that meet the
-    most for their cost are chosen until all is met or nothing more fits into the budget [1], with lazy
-    evaluation; those that turn out redundant are left out; then weighted swaps look for a cheaper set, or
-    under a budget for one that meets more. If the problem has errors, swaps of one node for another at no
+    Without a budget the problem is reduced first, and its components are solved separately. The nodes that
+    meet the most for their cost are chosen, with lazy evaluation, until all requirements are met or nothing
+    more fits into the budget [1]; redundant nodes are removed; then weighted swaps search for a cheaper set,
+    or under a budget for one that meets more. If the problem has errors, swaps of one node for another at no
     greater cost reduce them.
 
     Args:
@@ -101,11 +101,10 @@ def greedy(problem: DominationProblem, *, seed: int = 0) -> Solution:
         seed: Equal problems and seeds give equal solutions.
 
     Returns:
-        A set that costs at most 1 + ln(d) times the least, d being the most that one node adds to what is
-        asked for: its out-degree and its groups plus k [1, 2]. Under a budget, with equal costs and k = 1,
-        the nodes not forced in meet at least 1 - 1/e of the most that can be met beyond those [3]. The lower
-        bound on the cost is that of a packing of the nodes; under a budget it is that of the nodes forced
-        in, and what must stay unmet and the errors have none.
+        A set that costs at most 1 + ln(d) times the least, where d is the most that one node contributes to
+        the requirements: its out-degree and its groups plus k [1, 2]. Under a budget, with equal costs and
+        k = 1, it meets at least 1 - 1/e of the most that can be met [3]. The lower bound on the cost is that
+        of a packing of the nodes; under a budget there is no bound.
 
     Notes:
         The number of swaps is limited, not their time.
@@ -137,9 +136,9 @@ def greedy(problem: DominationProblem, *, seed: int = 0) -> Solution:
 
 
 def greedy_parts(pieces: list[Cover], *, seed: int, effort: int = 1) -> list[list[int]]:
-    """Choose columns of each cover greedily, leave out redundant ones, and swap while that helps.
+    """Choose columns of each cover greedily, remove redundant ones, and improve the choice by swaps.
 
-    Covers of more than a thousand rows get `effort` times the swaps.
+    Covers of more than a thousand rows get `effort` times as many swaps.
     """
     shares = [_num_steps(piece) for piece in pieces]
     scale = min(1.0, _MOST_STEPS / max(sum(shares), 1))
@@ -151,7 +150,7 @@ def greedy_parts(pieces: list[Cover], *, seed: int, effort: int = 1) -> list[lis
 
 
 def part_bound(piece: Cover, *, whole: bool) -> int | float:
-    """A bound on the cost of a cover without a budget; a whole number if all costs are."""
+    """A lower bound on the cost of a cover without a budget; an integer if all costs are integers."""
     bound = dual_bound(piece)
     return rounded_up(bound) if whole else bound
 
@@ -164,7 +163,7 @@ def _part(cover: Cover, steps: int, seed: int) -> list[int]:
 
 
 def _num_steps(cover: Cover) -> int:
-    """As many as the size of the cover allows, so that the search ends in seconds."""
+    """The number of swaps for which the search of a cover of this size ends in seconds."""
     rows, columns = len(cover.needs), len(cover.candidates)
     if rows == 0:
         return 0
@@ -173,29 +172,28 @@ def _num_steps(cover: Cover) -> int:
 
 
 def cover_order(problem: DominationProblem, *, first: Iterable[int] = ()) -> tuple[int, ...]:
-    """Order all nodes such that every prefix of the order is a good cover.
+    """Order all nodes such that every prefix is a good cover.
 
-    The next node is the one that dominates, for its cost, the most nodes that are not dominated yet; a node
-    dominates itself, and a group counts as a node that its members dominate. Once all are dominated, those
-    count that only one node dominates, then those that only two do, and so on. Equally good nodes come by
-    number.
+    The next node is the one that dominates, for its cost, the most nodes that are not dominated so far; a
+    node dominates itself, and a group counts as a node that its members dominate. When all are dominated,
+    nodes count that only one node dominates, then nodes that only two dominate, and so on. Ties are broken by
+    index.
 
     Args:
-        problem: The graph, costs, groups and forced nodes; its other parts do not matter.
-        first: Nodes that come first, ordered among themselves by the same rule: a set chosen before. After
-            them come those forced in, then all that are not forced, then those forced out.
+        problem: The graph, costs and groups; its other parts are ignored.
+        first: Nodes that come first, ordered by the same rule, such as a set chosen before.
 
     Returns:
-        All nodes, each once. With equal costs, nothing forced and no `first`, the prefix of p nodes dominates
-        at least 1 - 1/e of what the best p nodes do [1], and the shortest prefix that dominates all has at
-        most 1 + ln(d) times as many nodes as the smallest dominating set, d being the largest out-degree plus
-        1 [2]. With a group, it counts as a node throughout.
+        All nodes, each once. With equal costs and no `first`, the prefix of p nodes dominates at least
+        1 - 1/e of what the best p nodes do [1], and the shortest prefix that dominates all has at most
+        1 + ln(d) times as many nodes as the smallest dominating set, where d is the largest out-degree plus
+        1 [2]. A group counts as a node throughout.
 
     Raises:
         ValueError: `first` has a node that is not in the graph.
 
     Notes:
-        Lazy evaluation: nearly linear in the number of edges for each number of dominators that is passed.
+        Lazy evaluation: nearly linear in the number of edges per number of dominators.
 
     References:
         [1] Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing submodular set
@@ -218,7 +216,7 @@ def _stages(problem: DominationProblem, first: tuple[int, ...]) -> list[set[int]
 
 
 def _ordered(cover: Cover, before: list[int], stage: set[int]) -> list[int]:
-    """The nodes of a stage in their order, after others that come before."""
+    """The nodes of a stage in order, given the nodes before them."""
     order: list[int] = []
     level = 1
     while len(order) < len(stage):

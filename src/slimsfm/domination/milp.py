@@ -15,13 +15,13 @@ class Program:
     """Minimize c x over 0-1 vectors x between two others, with A x >= b."""
 
     objective: np.ndarray
-    """c."""
+    """Vector c."""
 
     matrix: csr_array
-    """A."""
+    """Matrix A."""
 
     lower: np.ndarray
-    """b."""
+    """Vector b."""
 
     least: np.ndarray
     """Least value of each variable, 0 or 1."""
@@ -34,7 +34,7 @@ class Program:
         return replace(self, objective=objective)
 
     def holding(self, value: int | float) -> "Program":
-        """The program with its objective held at a value or below."""
+        """The program with the constraint that its objective is at most a value."""
         limit = value + TOLERANCE * max(1.0, abs(value))
         row = csr_array(-self.objective[None])
         return replace(
@@ -44,7 +44,7 @@ class Program:
         )
 
     def extended(self, old: csr_array, new: csr_array, lower: np.ndarray, costs: np.ndarray) -> "Program":
-        """The program with more variables, of given costs, and the constraints old x + new y >= lower."""
+        """The program with more variables of given costs, and the constraints old x + new y >= lower."""
         count = len(costs)
         return Program(
             objective=np.concatenate([self.objective, costs]),
@@ -57,21 +57,21 @@ class Program:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Minimum:
-    """What a search for a program's minimum ended with."""
+    """The result of minimizing a program."""
 
     values: np.ndarray | None
-    """The best variables found, or None."""
+    """The best feasible vector found, or None."""
 
     bound: int | float
-    """No feasible vector has a smaller objective."""
+    """Lower bound: no feasible vector has a smaller objective."""
 
 
 Minimizer = Callable[[Program, np.ndarray, float], Minimum]
-"""Minimizes a program, given what is known of a good vector's first variables, in so many seconds at most."""
+"""Minimizes a program, given the first variables of a good vector and a time limit in seconds."""
 
 
 def covering_program(cover: Cover) -> Program:
-    """The cheapest choice for a cover without a budget; one variable for each of its candidates."""
+    """The program of the cheapest choice for a cover without a budget, one variable per candidate."""
     columns = cover.candidates
     return Program(
         objective=cover.costs[columns],
@@ -84,17 +84,17 @@ def covering_program(cover: Cover) -> Program:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StagedProgram:
-    """A part of a problem, without its last aim: the total error.
+    """The program of a part of a problem, without its last objective, the total error.
 
-    Its variables are first the part's nodes, whether each is chosen; then, under a budget, its requirements,
-    whether each is met.
+    The first variables say whether each node of the part is chosen; under a budget, further variables say
+    whether each requirement is met.
     """
 
     nodes: Columns
     """The nodes of the part."""
 
     rows: Rows
-    """The part's requirements that ask for something."""
+    """The requirements of the part that are positive."""
 
     program: Program
     """All constraints; the objective is zero."""
@@ -107,7 +107,7 @@ class StagedProgram:
 
 
 def staged_program(problem: DominationProblem, rows: Rows) -> StagedProgram:
-    """The program of some of a problem's requirements that have no node in common with the others."""
+    """The program of some requirements of a problem that share no node with the others."""
     nodes = rows[rows < problem.num_nodes]
     matrix, needs = problem.requirements
     open_rows = rows[needs[rows] > 0]
@@ -141,8 +141,8 @@ def error_program(
 ) -> Program:
     """A staged program that minimizes the total error: the p-median program [1].
 
-    A variable more for each edge says that its target, being met but not chosen, counts with its error. Only
-    edges from chosen nodes can be counted with.
+    One more variable per edge says that its target, which is met but not chosen, counts with this error. Only
+    edges from chosen nodes can count.
 
     References:
         [1] ReVelle and Swain, Central facilities location, Geographical Analysis 2, 1970.
