@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -36,18 +37,15 @@ class Counting:
             yield _Submitting(executor, self.blocks)
 
 
-class _Submitting:
+class _Submitting(Executor):
     def __init__(self, executor, blocks):
         self._executor, self._blocks = executor, blocks
 
-    def submit(self, function, *arguments):
+    def submit(self, function, /, *arguments, **keywords):
         for one in arguments:
             if hasattr(one, "pairs"):
                 self._blocks[one.pairs.tobytes()] = len(one.pairs)
-        return self._executor.submit(function, *arguments)
-
-    def __getattr__(self, name):
-        return getattr(self._executor, name)
+        return self._executor.submit(function, *arguments, **keywords)
 
 
 @pytest.fixture(scope="module")

@@ -141,7 +141,7 @@ def test_auto_is_matches_or_tracks_where_there_are_none(exact):
 
 @pytest.fixture
 def localized(monkeypatch):
-    """The edges (reference, query) that are decided by matching anew."""
+    """The edges (reference, query) that are decided by matching again."""
     edges = []
     localize = LocalizeEdges.error
 
@@ -168,14 +168,14 @@ def test_hybrid_localizes_what_sees_common_points_but_has_no_matches(exact, loca
 
 def test_hybrid_looks_closer_at_missing_poses_and_at_errors_near_the_threshold(boulder, localized):
     map_, options = boulder.map, GraphOptions(edges="hybrid", threshold=0.02)
-    hybrid, matched, anew = (make(map_, options) for make in (HybridEdges, MatchEdges, LocalizeEdges))
+    hybrid, matched, again = (make(map_, options) for make in (HybridEdges, MatchEdges, LocalizeEdges))
     matched_pairs = {tuple(pair) for pair in matched.pairs().tolist()}
     decided = 0
     for u, v in hybrid.pairs()[::3].tolist():
         found = as_tuple(hybrid.errors(u, v))
         asked = localized.copy()
         by_matches = as_tuple(matched.errors(u, v)) if (u, v) in matched_pairs else (np.inf, np.inf)
-        by_localizing = as_tuple(anew.errors(u, v))
+        by_localizing = as_tuple(again.errors(u, v))
         is_open = [error == np.inf or 0.01 <= error <= 0.04 for error in by_matches]
         assert asked == [edge for edge, open_ in zip([(u, v), (v, u)], is_open, strict=True) if open_]
         assert found == tuple(np.where(is_open, by_localizing, by_matches))

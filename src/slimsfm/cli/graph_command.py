@@ -32,17 +32,17 @@ def graph(
 ) -> None:
     """Find out which reference images localize which others.
 
-    The graph is kept in the map, and `reduce` uses it. After an interruption the same command goes on where
+    The graph is kept in the map, and `reduce` uses it. After an interruption the same command resumes where
     it stopped.
 
     Args:
-        map: A map.
+        map: The map; the graph is kept in its folder.
         edges: How edges are found.
         execution: Where the work is done.
         networks: Where learned methods run.
-        output: Write the graph here as well, as npz.
-        json: Write the figures here.
-        overwrite: Replace what is there.
+        output: Also write the graph here, as npz.
+        json: Write the statistics here.
+        overwrite: Replace existing files.
     """
     watch = Stopwatch()
     networks.apply()
