@@ -8,12 +8,28 @@ from rich.table import Table
 
 from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.output import console, counts, size
+from slimsfm.errors import InputError
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions, ReferenceGraph, load_or_compute_graph
-from slimsfm.mapping.io import bytes_by_part
+from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
 from slimsfm.progress import shown
 from slimsfm.reduction import Candidate, Frontier, GraphProvider, Prediction, Reduced, ReduceOptions
+from slimsfm.reduction.pareto import check_reducible
+
+
+def read_reducible(path: Path) -> Map:
+    """Read a map that is to be reduced.
+
+    Raises:
+        InputError: The map has no features or fewer than two images.
+    """
+    full = read_map(path)
+    try:
+        check_reducible(full)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return full
 
 
 def kept_graph(path: Path, execution: Execution) -> GraphProvider:

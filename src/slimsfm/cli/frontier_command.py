@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.choices import frontier_to_json, kept_graph, print_frontier, promise
+from slimsfm.cli.choices import frontier_to_json, kept_graph, print_frontier, promise, read_reducible
 from slimsfm.cli.execution import Execution
 from slimsfm.cli.output import Flat, MapPath, Stopwatch, check_output, console, finish, parse
 from slimsfm.files import replacing
-from slimsfm.mapping.io import bytes_by_part, read_map
+from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.reduction import FrontierOptions, frontier, recommend
 from slimsfm.report.curves import curves_figure
@@ -41,7 +41,7 @@ def frontier_of(
             check_output(path, map, overwrite=overwrite)
     if curves:
         check_figure(curves)
-    full, size = read_map(map), bytes_by_part(map)["total"]
+    full, size = read_reducible(map), bytes_by_part(map)["total"]
     found = frontier(full, comparison, graph=kept_graph(map, execution), progress=shown)
     tried = {one.choice.use for one in found.candidates}
     recommended = {use: recommend(found, use) for use in comparison.uses if use in tried}

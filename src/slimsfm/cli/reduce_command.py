@@ -6,11 +6,11 @@ from typing import Annotated
 
 import tyro
 
-from slimsfm.cli.choices import kept_graph, print_change, print_dominating_set, promise
+from slimsfm.cli.choices import kept_graph, print_change, print_dominating_set, promise, read_reducible
 from slimsfm.cli.execution import Execution
 from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
 from slimsfm.cli.units import LimitArguments
-from slimsfm.mapping.io import read_map, write_map
+from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
 from slimsfm.reduction import ImageOptions, ReduceOptions
 from slimsfm.reduction import reduce as reduce_map
@@ -75,7 +75,7 @@ def reduce(
     """
     watch = Stopwatch()
     check_output(output, map, overwrite=overwrite)
-    full, options = read_map(map), choosing.options
+    full, options = read_reducible(map), choosing.options
     reduced = reduce_map(full, options, graph=kept_graph(map, execution), progress=shown)
     write_map(reduced.map, output, overwrite=overwrite)
     for note in reduced.notes:
