@@ -17,7 +17,6 @@ import numpy as np
 import pycolmap
 
 from slimsfm.geometry import corner_error
-from slimsfm.graph import compute_graph
 from slimsfm.localization import Localizer
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.importing import import_colmap
@@ -25,7 +24,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.photos import list_images, read_image
 from slimsfm.progress import shown
-from slimsfm.reduction import reduce_map
+from slimsfm.reduction import ImageOptions, ReduceOptions, reduce
 
 Poses = dict[str, pycolmap.Rigid3d]
 
@@ -48,8 +47,9 @@ def compare(folder: Path, temporary: Path) -> None:
     references.mkdir()
     for name in set(names) - set(queries):
         os.symlink(folder / name, references / name)
-    built = build_map(references, workspace=temporary / "build", progress=shown)
-    slim = reduce_map(built, compute_graph(built, progress=shown).graph).map
+    built = build_map(references, progress=shown)
+    options = ReduceOptions(image_choice=ImageOptions(solver="exact"))
+    slim = reduce(built, options, progress=shown).map
     cameras = dict.fromkeys(queries, built.shared_camera)
     expected = localize(slim, folder, cameras)
     for form in ("old binary", "text", "rigs and frames"):

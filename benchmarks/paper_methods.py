@@ -35,7 +35,7 @@ from slimsfm.mapping.subset import keep_images
 from slimsfm.methods.loftr.matcher import Loftr
 from slimsfm.methods.superpoint import SuperPoint, describe_pixels
 from slimsfm.photos import read_image
-from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
+from slimsfm.reduction import DominatingSetOptions, dominating_set, keep_random_images
 from slimsfm.weights import WEIGHTS, Runtime, use_runtime
 
 
@@ -173,7 +173,7 @@ class Row:
 
 def _rows(method: Method, map_: Map, made: ObjectSequences, output: Path, count: int) -> dict[str, Row]:
     graph = compute_graph(map_, GraphOptions(edges="matches")).graph
-    names, chosen = list(map_.images), dominating_set(graph, ReductionOptions()).chosen
+    names, chosen = list(map_.images), dominating_set(graph, DominatingSetOptions()).chosen
     variants: Mapping[str, list[Map]] = {
         "full": [map_],
         "dominating": [keep_images(map_, (names[i] for i in chosen))],

@@ -23,9 +23,9 @@ from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping import Map, keep_images, read_map, write_map
-from slimsfm.mapping.io import bytes_by_part, weigh_map
+from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
-from slimsfm.reduction import FrontierOptions, Maker, ReductionOptions, dominating_set, frontier, recommend
+from slimsfm.reduction import DominatingSetOptions, dominating_set, reduce
 from slimsfm.synthetic.objects import OBJECTS
 
 RETRIEVED = (1, 2, 3, 5, 10)
@@ -82,8 +82,7 @@ def measure(scene: Scene, folder: Path, *, brief: bool) -> Iterator[Result]:
     """Run every strategy on every map."""
     full, points = scene.references, folder / f"{scene.name}-points"
     if not points.exists():
-        found = frontier(full, None, weigh_map, FrontierOptions(uses=("direct",)), shown)
-        write_map(Maker(full).make(recommend(found, "direct").choice), points)
+        write_map(reduce(full, progress=shown).map, points)
     kinds = [("exhaustive", 1), *(("retrieval", k) for k in ((2,) if brief else RETRIEVED))]
     kinds += [("progressive", 1), ("direct", 1)]
     maps = {"full": (full, scene.bytes)}
@@ -101,7 +100,7 @@ def measure(scene: Scene, folder: Path, *, brief: bool) -> Iterator[Result]:
 def dominating(full: Map) -> Map:
     """The smallest dominating set of images."""
     graph = compute_graph(full, GraphOptions()).graph
-    chosen = dominating_set(graph, ReductionOptions(), full).chosen
+    chosen = dominating_set(graph, DominatingSetOptions(), full).chosen
     return keep_images(full, [graph.names[i] for i in chosen])
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from PIL import Image as PilImage
 from PIL import ImageDraw, ImageFont
-from slimsfm.synthetic.film import Film, film
 
 from benchmark_scenes import rendered
+from film import Film, film
 from slimsfm.arrays import Image
 from slimsfm.files import replacing
 from slimsfm.localization import Localizer

@@ -31,7 +31,7 @@ from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import ReferenceGraph, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
-from slimsfm.reduction import ReductionOptions, dominating_set
+from slimsfm.reduction import DominatingSetOptions, dominating_set
 from slimsfm.synthetic import shapes, texture
 from slimsfm.synthetic.objects import OBJECTS
 from slimsfm.synthetic.render import Light, Scene
@@ -44,10 +44,10 @@ MOST_LOST = 1.0
 GOLDEN = (5**0.5 - 1) / 2  # its multiples fill the unit interval evenly
 
 CHOICES = {
-    "the paper's set": ReductionOptions(solver="random"),
-    "exact": ReductionOptions(),
-    "exact, k = 2": ReductionOptions(dominators=2),
-    "exact + rim": ReductionOptions(rim=True),
+    "the paper's set": DominatingSetOptions(solver="random"),
+    "exact": DominatingSetOptions(),
+    "exact, k = 2": DominatingSetOptions(dominators=2),
+    "exact + rim": DominatingSetOptions(rim=True),
 }
 TARGETED = ("exact + rim", "default")
 

@@ -18,19 +18,18 @@ from benchmark_scenes import Scene, scenes
 from slimsfm.evaluation.protocol import evaluate
 from slimsfm.evaluation.scores import score
 from slimsfm.graph import GraphOptions, compute_graph
+from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping import Map, keep_images, read_map, write_map
-from slimsfm.mapping.io import bytes_by_part, weigh_map
+from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.reduction import (
     Choice,
-    FrontierOptions,
-    Maker,
+    DominatingSetOptions,
     Prediction,
-    ReductionOptions,
     Trials,
+    apply_choice,
     dominating_set,
-    frontier,
-    recommend,
+    reduce,
 )
 from slimsfm.selection import SELECTORS
 from slimsfm.selection.leave_one_out import LeftOut
@@ -89,9 +88,9 @@ def measure(scene: Scene, slim: Path, *, brief: bool) -> Iterator[Result]:
     full = scene.references
     for strategy in ("exhaustive", "direct"):
         yield tried(scene, full, scene.bytes, "full", strategy)
-    found = frontier(full, None, weigh_map, FrontierOptions(uses=("direct",)), shown)
-    best = recommend(found, "direct")
-    yield tried(scene, *stored(Maker(full).make(best.choice), slim), "default", "direct", best.prediction)
+    best = reduce(full, progress=shown)
+    predicted = best.forecast["direct"].prediction
+    yield tried(scene, *stored(best.map, slim), "default", "direct", predicted)
     if not brief:
         yield from selected(scene, slim)
         yield from image_sets(scene, slim)
@@ -100,7 +99,7 @@ def measure(scene: Scene, slim: Path, *, brief: bool) -> Iterator[Result]:
 def selected(scene: Scene, slim: Path) -> Iterator[Result]:
     """Points by every selector."""
     left_out = LeftOut(scene.references)
-    trials, maker = Trials(scene.references, left_out), Maker(scene.references)
+    trials, described = Trials(scene.references, left_out), describe_points(scene.references)
     problem = selection_problem(scene.references, left_out)
     for name, select in SELECTORS.items():
         for budget in BUDGETS:
@@ -109,7 +108,7 @@ def selected(scene: Scene, slim: Path) -> Iterator[Result]:
                 if len(points) < budget:
                     continue
                 choice = Choice(use="direct", method=name, detail="", images=(), points=points)
-                made = stored(maker.make(choice), slim)
+                made = stored(apply_choice(scene.references, choice, described=described), slim)
                 yield tried(scene, *made, name, "direct", trials.points(points), seed=seed)
 
 
@@ -120,7 +119,7 @@ def image_sets(scene: Scene, slim: Path) -> Iterator[Result]:
     trials = Trials(full, LeftOut(full))
     for name, options in IMAGE_SETS.items():
         for seed in SEEDS if name == "paper" else (0,):
-            chosen = dominating_set(graph, ReductionOptions(seed=seed, **options), full).chosen
+            chosen = dominating_set(graph, DominatingSetOptions(seed=seed, **options), full).chosen
             images = [graph.names[i] for i in chosen]
             made = stored(keep_images(full, images), slim)
             foretold = trials.images(images)

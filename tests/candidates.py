@@ -1,4 +1,4 @@
-"""Candidates made by hand."""
+"""Candidates with chosen figures."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ MISSED = 4  # by the full map
 
 
 def prediction(missed, seconds=0.01, error=0.001):
-    """Of twenty tests, so that each one missed costs five points."""
+    """A prediction of twenty tests: each missed test costs five percentage points."""
     errors = np.where(np.arange(TESTS) < missed, np.inf, error)
     tests = tuple(f"{i}.png" for i in range(TESTS))
     inliers = np.where(np.isfinite(errors), 30, 0).astype(np.int64)
@@ -22,7 +22,7 @@ FULL = prediction(MISSED, seconds=1.0)
 def candidate(
     *, use="direct", method="kcover", points=100, images=0, size=1000, missed=0, ms=10.0, error=0.001
 ):
-    """One that misses so many tests more than the full map."""
+    """A candidate that misses `missed` more tests than the full map."""
     return Candidate(
         choice=Choice(
             use=use,

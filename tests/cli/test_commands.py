@@ -15,7 +15,7 @@ from rendered import MAPPING_FRAMES, NAME, QUERY_FRAMES
 from slimsfm.cli import COMMANDS
 from slimsfm.domination import dominates
 from slimsfm.geometry import corner_error
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 

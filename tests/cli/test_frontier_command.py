@@ -29,7 +29,7 @@ def exact_path(exact, tmp_path) -> Path:
     return tmp_path / "map"
 
 
-def test_the_table_lists_every_way_and_recommends_one_a_use(boulder, drawn):
+def test_the_table_lists_every_way_and_recommends_one_per_use(boulder, drawn):
     out, data, _ = drawn
     lines = out.splitlines()
     assert lines[0].split()[:3] == ["for", "method", "asked"]
@@ -82,7 +82,7 @@ def test_curves_of_an_unknown_format_are_refused_before_any_work(exact_path, tmp
     assert not (exact_path / "graph-matches.npz").exists()
 
 
-def test_it_changes_nothing_but_for_a_graph_that_is_kept(exact_path):
+def test_only_the_graph_is_written_into_the_map(exact_path):
     before = contents(exact_path)
     done = slimsfm("frontier", exact_path, "--budgets", 30, "--uses", "direct", "--selectors", "random")
     assert done.code == 0, done.err
@@ -91,7 +91,7 @@ def test_it_changes_nothing_but_for_a_graph_that_is_kept(exact_path):
     assert set(contents(exact_path)) - set(before) == {"graph-matches.npz"}
 
 
-def test_what_is_there_is_replaced_where_asked(exact_path, tmp_path):
+def test_existing_files_are_replaced_only_on_request(exact_path, tmp_path):
     taken = tmp_path / "frontier.json"
     taken.write_text("mine")
     command = ("frontier", exact_path, "--uses", "direct", *FEW, "--json", taken)

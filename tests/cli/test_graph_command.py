@@ -9,10 +9,15 @@ import pytest
 
 from commands import contents, slimsfm
 from slimsfm import execution
+from slimsfm.cli.execution import Execution
 from slimsfm.domination import dominates
-from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute, compute_graph
-from slimsfm.graph.io import load_or_compute_graph, read_given_graph
+from slimsfm.errors import WorkError
+from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.io import read_given_graph
 from slimsfm.mapping.io import read_map, write_map
+
+TRACKS = GraphOptions(edges="tracks")
 
 
 @pytest.fixture
@@ -87,7 +92,7 @@ def test_a_map_without_matches_has_other_ways(bare, edges):
 
 
 def test_a_map_without_matches_is_told_so(refused, bare, tmp_path):
-    naming = "has no matches; use --edges tracks or localize"
+    naming = "has no matches; set edges to tracks or localize"
     refused("graph", bare, "--edges", "matches", naming=naming)
     refused("reduce", bare, "-o", tmp_path / "slim", "--edges", "matches", naming=naming)
 
@@ -117,22 +122,20 @@ def test_what_is_there_is_not_replaced_unasked(refused, a_map, tmp_path, option)
 
 
 def test_a_scheduler_that_does_not_answer(a_map, monkeypatch):
-    monkeypatch.setattr(compute, "_WORTH_SECONDS", 0.0)
     monkeypatch.setattr(execution, "_CONNECT_S", 0.3)
-    outcome = slimsfm("graph", a_map, "--edges", "tracks", "--scheduler", "tcp://127.0.0.1:1")
-    assert outcome.code == 2
-    (line,) = [line for line in outcome.err.splitlines() if line.strip()]
-    assert line.startswith("slimsfm: tcp://127.0.0.1:1: no Dask scheduler answers there")
+    elsewhere = Execution(scheduler="tcp://127.0.0.1:1").open_executor()
+    with pytest.raises(WorkError, match=r"^tcp://127\.0\.0\.1:1: no Dask scheduler answers there"):
+        load_or_compute_graph(read_map(a_map), a_map, TRACKS, elsewhere, min_seconds=0.0)
     assert not (a_map / "graph-tracks.npz").exists()
 
 
-def test_a_cluster_is_used(a_map, scheduler, monkeypatch):
-    monkeypatch.setattr(compute, "_WORTH_SECONDS", 0.0)
-    done = slimsfm("graph", a_map, "--edges", "tracks", "--scheduler", scheduler)
-    assert done.code == 0, done.err
-    map_ = read_map(a_map)
-    kept = load_or_compute_graph(map_, a_map, GraphOptions(edges="tracks"), progress=never).graph
-    assert np.array_equal(kept.dense(), compute_graph(map_, GraphOptions(edges="tracks")).graph.dense())
+def test_a_cluster_is_used(a_map, scheduler):
+    elsewhere, map_ = Execution(scheduler=scheduler).open_executor(), read_map(a_map)
+    run = load_or_compute_graph(map_, a_map, TRACKS, elsewhere, min_seconds=0.0)
+    kept = load_or_compute_graph(map_, a_map, TRACKS, progress=never).graph
+    assert np.array_equal(kept.dense(), run.graph.dense())
+    assert np.array_equal(kept.dense(), compute_graph(map_, TRACKS).graph.dense())
+    assert slimsfm("graph", a_map, "--edges", "tracks", "--scheduler", scheduler).code == 0
 
 
 def test_reduce_uses_the_errors_of_another_system(exact, tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from commands import contents, slimsfm, without_progress
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
@@ -116,9 +116,10 @@ def test_an_interrupted_command_keeps_what_it_would_have_replaced(boulder, start
 
 
 SMALL_BLOCKS = """
-from slimsfm.graph import compute
-compute._BLOCK_SECONDS, compute._WORTH_SECONDS = 0.02, 0.0
-from slimsfm.cli import main
+from functools import partial
+from slimsfm.cli import graph_command, main
+find = graph_command.load_or_compute_graph
+graph_command.load_or_compute_graph = partial(find, block_seconds=0.02, min_seconds=0.0)
 main()
 """
 

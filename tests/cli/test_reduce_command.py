@@ -1,4 +1,4 @@
-"""`slimsfm reduce`: points by default, images or both where asked, within limits."""
+"""`slimsfm reduce`: points by default, images or both on request, within limits."""
 
 import json
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from slimsfm.features import unit_rows
 from slimsfm.geometry import corner_error
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
-from slimsfm.reduction import ReductionOptions, reduce_map
+from slimsfm.reduction import DominatingSetOptions, dominating_set
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Pointed:
 
 @pytest.fixture(scope="session")
 def pointed(boulder, tmp_path_factory) -> Pointed:
-    """The rendered object's map as the command makes it small without being told how."""
+    """The rendered object's map, reduced without further options."""
     path = tmp_path_factory.mktemp("pointed") / "slim"
     return Pointed(path, slimsfm("reduce", boulder.map_path, "-o", path))
 
@@ -55,7 +55,7 @@ def reduced_to(small, tmp_path):
 
 @pytest.fixture
 def refused(small, tmp_path):
-    """Not before it has measured, so what a command writes meanwhile must be gone."""
+    """Checks that a refused command leaves nothing behind."""
 
     def check(*arguments, naming):
         before = contents(tmp_path)
@@ -69,7 +69,7 @@ def refused(small, tmp_path):
     return check
 
 
-def test_by_itself_it_keeps_points_for_direct_matching(boulder, pointed):
+def test_without_options_it_keeps_points_for_direct_matching(boulder, pointed):
     assert (pointed.outcome.code, pointed.outcome.err.strip()) == (0, "")
     *_, promise, last, next_line = pointed.outcome.out.splitlines()
     assert "predicted to localize 1" in promise
@@ -107,7 +107,7 @@ def test_references_are_localized_by_points(boulder, pointed, tmp_path):
         assert corner_error(pose, truth.images[one["name"]].cam_from_world(), truth.box) < 0.05
 
 
-def test_a_map_of_points_is_told_of_and_of_no_use_where_features_are_needed(pointed, tmp_path):
+def test_a_map_of_points_is_described_and_refused_where_features_are_needed(pointed, tmp_path):
     facts = json.loads(slimsfm("info", pointed.path, "--json").out)
     assert facts["points"] == len(read_map(pointed.path).point3D_ids)
     assert facts["observations"] == 0
@@ -174,13 +174,14 @@ def test_named_images_may_be_joined_by_points(reduced_to):
     assert len(both.point_descriptors.points) >= 100
 
 
-def test_the_paper_by_name(boulder, tmp_path):
+def test_the_procedure_of_the_paper_is_followed_and_named(boulder, tmp_path):
     done = slimsfm("reduce", boulder.map_path, "-o", tmp_path / "slim", "--paper")
     assert done.code == 0, done.err
     map_ = boulder.map
     graph = compute_graph(map_, GraphOptions(edges="localize", candidates="all")).graph
-    expected = reduce_map(map_, graph, ReductionOptions(solver="random")).map
-    assert list(read_map(tmp_path / "slim").images) == list(expected.images)
+    expected = dominating_set(graph, DominatingSetOptions(solver="random"), map_).chosen
+    assert list(read_map(tmp_path / "slim").images) == [graph.names[i] for i in expected]
+    assert "dominating (the paper's Algorithms 1 and 2: smallest of 1000 random sets" in done.out
 
 
 @pytest.mark.parametrize("use", ["direct", "images"])
@@ -202,7 +203,7 @@ def test_it_keeps_to_a_number_of_images(reduced_to):
     assert least == 1
 
 
-def test_what_may_be_lost_makes_it_smaller(reduced_to):
+def test_a_larger_allowed_loss_gives_a_smaller_map(reduced_to):
     who = ("--selector", "random")
     careful, smallest, lossless = (
         len(reduced_to(*who, "--overwrite", *limit)[0].point3D_ids)
@@ -225,17 +226,20 @@ def test_images_of_a_dominating_set_are_dropped_to_keep_to_a_size(reduced_to):
     [
         (
             ("--max-bytes", "1kB", "--selector", "random"),
-            "no choice for direct meets max-bytes 1000; the least loss is",
+            "no choice for direct meets max_bytes 1000; the nearest, random (100 points), has 100 points and",
         ),
-        (("--max-ms", "0", "--selector", "random"), "no choice for direct meets max-ms 0"),
-        (("--max-points", "0", "--selector", "random"), "no choice for direct meets max-points 0"),
-        (("--for", "images", "--max-images", "0"), "no choice for images meets max-images 0"),
+        (("--max-ms", "0", "--selector", "random"), "no choice for direct meets max_ms 0"),
+        (("--max-points", "0", "--selector", "random"), "no choice for direct meets max_points 0"),
+        (("--for", "images", "--max-images", "0"), "no choice for images meets max_images 0"),
         (("--for", "both", "--max-bytes", "10 kB", "--selector", "random"), "no choice for"),
-        (("--solver", "exact", "--max-bytes", "1kB"), "not even one image keeps to"),
+        (
+            ("--solver", "exact", "--max-bytes", "1kB"),
+            "no set of images meets max_bytes 1000; the nearest",
+        ),
     ],
     ids=str,
 )
-def test_what_cannot_be_met_is_refused_and_nothing_written(refused, arguments, naming):
+def test_limits_that_cannot_be_met_are_refused_and_nothing_is_written(refused, arguments, naming):
     refused(*arguments, naming=naming)
 
 
@@ -258,3 +262,13 @@ def test_a_map_built_without_a_detector_keeps_a_dominating_set_with_its_photos(b
         refused = slimsfm(*command)
         assert refused.code == 2
         assert "was built without a detector" in refused.err
+
+
+def test_a_removed_selector_is_replaced_with_a_note(small, tmp_path):
+    for name, selector in (("old", "probabilistic"), ("new", "kcover")):
+        done = slimsfm("reduce", small, "-o", tmp_path / name, "--selector", selector)
+        assert done.code == 0, done.err
+        assert ("note: selector probabilistic has been removed; kcover is used instead" in done.out) == (
+            name == "old"
+        )
+    assert contents(tmp_path / "old") == contents(tmp_path / "new")

@@ -1,4 +1,4 @@
-"""Amounts as a user writes them."""
+"""Amounts with units."""
 
 import pytest
 
@@ -33,12 +33,12 @@ def test_percentages(text, value):
 @pytest.mark.parametrize(
     "text", ["", "kB", "12 parsecs", "-1", "1e3", "1,5 MB", "nan", "inf", "1 %", "1.2.3", "."]
 )
-def test_no_sizes(text):
+def test_invalid_sizes(text):
     with pytest.raises(InputError, match="max-bytes must be a size such as 100kB or 2MB, got"):
         parse_bytes(text, "max-bytes")
 
 
 @pytest.mark.parametrize("text", ["", "%", "1 kB", "-1%", "one"])
-def test_no_percentages(text):
+def test_invalid_percentages(text):
     with pytest.raises(InputError, match="max-loss must be a percentage such as 1%, got"):
         parse_percent(text, "max-loss")

@@ -13,7 +13,7 @@ from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions
 from slimsfm.localization import LocalizationOptions, search, verification
 from slimsfm.pose import RansacOptions
-from slimsfm.reduction import ReductionOptions, forecast
+from slimsfm.reduction import DominatingSetOptions, forecast
 from slimsfm.selection import information, problem
 
 PAGE = " ".join((Path(__file__).parents[2] / "docs" / "method.md").read_text(encoding="utf-8").split())
@@ -33,7 +33,7 @@ def test_the_weights_of_the_confidence_match_the_code():
     ("words", "value"),
     [
         (r"\tau = {:g}", GraphOptions().threshold),
-        (r"\tau = {:g}", ReductionOptions().threshold),
+        (r"\tau = {:g}", DominatingSetOptions().threshold),
         ("probability that $e < {:g}$", ADD_FRACTIONS[0]),
         (r"c_t \ge {:g}", search.SURE),
         (r"\hat{{e}}_t \le {:g}", search.ACCURATE),

@@ -24,29 +24,20 @@ def problem_parts(draw, max_nodes=12):
     n = len(adjacency)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     costs = rng.integers(1, 9, n) / 4 if draw(st.booleans()) else None
-    order = rng.permutation(n).tolist()
-    num_in, num_out = draw(st.integers(0, n // 4)), draw(st.integers(0, n // 3))
-    forced_in, forced_out = order[:num_in], order[num_in : num_in + num_out]
-    budget = None
-    if draw(st.booleans()):
-        spent = len(forced_in) if costs is None else float(costs[forced_in].sum())
-        budget = spent + draw(st.integers(0, 2 * n)) / 4
+    budget = draw(st.integers(0, 2 * n)) / 4 if draw(st.booleans()) else None
     return {
         "adjacency": adjacency,
         "costs": costs,
         "dominators": draw(st.integers(1, 3)),
         "budget": budget,
-        "forced_in": forced_in,
-        "forced_out": forced_out,
-        "groups": _groups(rng, n, forced_out, order[-1]) if draw(st.booleans()) else None,
+        "groups": _groups(rng, n) if draw(st.booleans()) else None,
         "errors": rng.integers(0, 20, (n, n)) / 8 if draw(st.booleans()) else None,
     }
 
 
-def _groups(rng, n, forced_out, allowed):
+def _groups(rng, n):
     groups = rng.random((rng.integers(1, 4), n)) < 0.3
-    lost = ~groups[:, np.setdiff1d(np.arange(n), forced_out)].any(axis=1)
-    groups[lost, allowed] = True
+    groups[~groups.any(axis=1), rng.integers(n)] = True
     return groups
 
 
@@ -56,20 +47,19 @@ def all_sets(problem):
 
 
 def unmet_of(problem, sets):
-    """How much each set leaves unmet, straight from the definition."""
+    """How many requirements each set leaves unmet, by the definition, and which nodes it meets."""
     n, k = problem.num_nodes, problem.dominators
     edges = problem.adjacency.toarray() & ~np.eye(n, dtype=bool)
-    out = np.isin(np.arange(n), problem.forced_out)
     dominators = sets.astype(int) @ edges
-    available = edges[~out].sum(axis=0)
-    asked = np.where(available > 0, np.minimum(k, available), np.where(out, 0, n))
+    available = edges.sum(axis=0)
+    asked = np.where(available > 0, np.minimum(k, available), n)
     met = sets | (dominators >= asked)
     in_group = sets.astype(int) @ problem.groups.toarray().T.astype(int) > 0
     return (~met).sum(axis=1) + (~in_group).sum(axis=1), met
 
 
 def errors_of(problem, sets):
-    """The total error of each set, straight from the definition."""
+    """The total error of each set, by the definition."""
     if problem.errors is None:
         return np.zeros(len(sets))
     _, met = unmet_of(problem, sets)
@@ -80,17 +70,16 @@ def errors_of(problem, sets):
 
 
 def best_merit(problem):
-    """The least of number unmet, cost and error, in this order, of all sets that keep to a problem."""
+    """The least of number unmet, cost and error, in this order, of all sets that satisfy a problem."""
     sets = all_sets(problem)
     unmet, costs, errors = unmet_of(problem, sets)[0], sets @ problem.costs, errors_of(problem, sets)
     fits = unmet == 0 if problem.budget is None else costs <= problem.budget
-    fits &= sets[:, list(problem.forced_in)].all(axis=1) & ~sets[:, list(problem.forced_out)].any(axis=1)
     best = np.lexsort((errors[fits], costs[fits], unmet[fits]))[0]
     return int(unmet[fits][best]), float(costs[fits][best]), float(errors[fits][best])
 
 
 def view_graph(num_views, *, seed=0):
-    """Views spread over a sphere; each dominates those within an angle of its own, of 20 to 40 degrees."""
+    """Views on a sphere; each dominates the views within its own angle, between 20 and 40 degrees."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(num_views, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

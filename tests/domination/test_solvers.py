@@ -69,7 +69,7 @@ def test_one_node_dominates_a_complete_graph(solve, n):
 @proving_solvers
 @quick
 @given(adjacency=digraphs(max_nodes=9))
-def test_integer_programming_finds_and_proves_the_size_that_trying_all_sets_finds(solve, adjacency):
+def test_integer_programming_finds_and_proves_the_size_of_an_exhaustive_search(solve, adjacency):
     solution = solve(DominationProblem(adjacency))
     assert len(solution.chosen) == solution.lower_bound == smallest_size(adjacency)
 
@@ -103,7 +103,7 @@ def test_exact_proves_a_view_graph_of_a_hundred_images_optimal():
     assert len(solution.chosen) < len(random_greedy(problem).chosen)
 
 
-def test_no_draw_finds_the_two_neighbouring_centres_of_a_double_star():
+def test_no_draw_finds_the_two_adjacent_centers_of_a_double_star():
     edges = np.zeros((8, 8), dtype=bool)
     edges[0, [1, 2, 3, 4]] = edges[1, [0, 5, 6, 7]] = True
     problem = DominationProblem(edges | edges.T)
@@ -144,7 +144,7 @@ def test_greedy_is_no_larger_than_random_on_view_graphs_and_its_bound_holds(seed
     assert ours.lower_bound <= len(best.chosen) <= len(ours.chosen) <= len(random_greedy(problem).chosen)
 
 
-def test_the_paper_draws_the_same_sets_as_ever():
+def test_the_paper_solver_still_draws_the_same_set():
     assert random_greedy(DominationProblem(view_graph(40)), seed=3).chosen == (
         4,
         7,
@@ -162,7 +162,7 @@ def test_the_paper_draws_the_same_sets_as_ever():
 
 
 def test_components_are_solved_apart():
-    """Twenty copies of a graph whose proof takes a moment would together take ages."""
+    """Solved as one graph, twenty copies would take far longer than twenty single proofs."""
     one = view_graph(60)
     copies = csr_array(block_diag([one] * 20))
     assert len(exact(DominationProblem(copies)).chosen) == 20 * len(exact(DominationProblem(one)).chosen)

@@ -19,7 +19,7 @@ RANDOM = np.random.default_rng(0).random((80, 80))
 @every_solver
 @quick
 @given(parts=problem_parts())
-def test_every_solver_keeps_to_every_problem_and_its_bounds_hold(solve, parts):
+def test_every_solver_satisfies_every_problem_and_its_bounds_hold(solve, parts):
     problem = DominationProblem(**parts)
     solution = solve(problem)
     unmet, cost, error = best_merit(problem)
@@ -37,7 +37,7 @@ def test_every_solver_keeps_to_every_problem_and_its_bounds_hold(solve, parts):
 @proving_solvers
 @settings(quick, max_examples=60)
 @given(parts=problem_parts())
-def test_integer_programming_finds_and_proves_what_trying_all_sets_finds(solve, parts):
+def test_integer_programming_finds_and_proves_the_optimum_of_an_exhaustive_search(solve, parts):
     problem = DominationProblem(**parts)
     solution = solve(problem)
     assert merit(problem, solution.chosen) == best_merit(problem)
@@ -54,7 +54,7 @@ def test_equal_seeds_give_equal_solutions_of_every_problem(solve, parts):
 
 @proving_solvers
 @pytest.mark.parametrize("dominators", [1, 2])
-def test_costs_of_any_size_are_minimized_to_a_part_in_a_million(solve, dominators):
+def test_costs_of_any_magnitude_are_minimized_within_one_in_a_million(solve, dominators):
     rng = np.random.default_rng(3)
     costs = 10 ** rng.uniform(-2, 2, 12)
     problem = DominationProblem(rng.random((12, 12)) < 0.25, costs=costs, dominators=dominators)
@@ -99,7 +99,7 @@ def test_more_dominators_never_cost_less_and_more_budget_never_meets_less():
     assert unmet[-2] > 0
 
 
-def test_a_budget_that_suffices_changes_nothing_but_the_way():
+def test_a_sufficient_budget_does_not_change_the_cost():
     adjacency = view_graph(50)
     assert exact(DominationProblem(adjacency, budget=50)).cost == exact(DominationProblem(adjacency)).cost
 
@@ -117,6 +117,6 @@ def test_without_or_tools_cpsat_says_how_to_get_them(monkeypatch):
         cpsat(DominationProblem(np.ones((2, 2))))
 
 
-def test_naming_the_solvers_does_not_import_or_tools():
+def test_importing_the_solvers_does_not_import_or_tools():
     code = "import sys; import slimsfm.domination; sys.exit('ortools' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -17,10 +17,10 @@ from slimsfm.evaluation.protocol import evaluate, prepare_queries
 from slimsfm.evaluation.results import map_path
 from slimsfm.evaluation.table import rows_of
 from slimsfm.geometry import corner_error
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.io import bytes_by_part, read_map
-from slimsfm.reduction import ReductionOptions, keep_random_images
+from slimsfm.reduction import DominatingSetOptions, keep_random_images
 
 OPTIONS = BenchmarkOptions(strategies=("exhaustive", "direct"))
 SPAN, QUERIES = range(14, 22), (16, 19)
@@ -161,7 +161,7 @@ def again(bench, result, tmp_path):
     assert result.maps
     shutil.copytree(kept(bench, "full"), map_path(tmp_path, "boulder", "sift", "full"))
 
-    def measure(sequences, variants=("dominating",), reduction=ReductionOptions()):
+    def measure(sequences, variants=("dominating",), reduction=DominatingSetOptions()):
         options = BenchmarkOptions(strategies=("direct",), variants=variants, reduction=reduction)
         return benchmark_object(sequences, BenchmarkSetup(folder=tmp_path, options=options))
 
@@ -169,7 +169,7 @@ def again(bench, result, tmp_path):
 
 
 def test_the_threshold_of_the_reduction_is_obeyed(again, sequences):
-    found = again(sequences, reduction=ReductionOptions(threshold=1e-12))
+    found = again(sequences, reduction=DominatingSetOptions(threshold=1e-12))
     assert len(found.maps[0].dominating_set) == found.maps[0].references == 6
     assert found.maps[0].edges == 0
 
@@ -211,7 +211,7 @@ def test_maps_are_built_with_the_extractor_of_the_method(tmp_path):
 
 
 def test_graphs_use_the_matcher_of_the_method():
-    options = BenchmarkOptions(edges="hybrid", reduction=ReductionOptions(threshold=0.02))
+    options = BenchmarkOptions(edges="hybrid", reduction=DominatingSetOptions(threshold=0.02))
     found = graph_options(options, parse_method("aliked+lightglue"))
     assert (found.edges, found.candidates, found.threshold, found.matcher) == (
         *("hybrid", "all"),

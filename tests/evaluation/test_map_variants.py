@@ -6,8 +6,7 @@ import pytest
 from scenes import algorithm_1, exact_map
 from slimsfm.domination import dominates
 from slimsfm.evaluation.variants import VARIANTS, VariantInputs, parse_variant
-from slimsfm.mapping.io import weigh_map
-from slimsfm.reduction import ReductionOptions, dominating_set, keep_random_images
+from slimsfm.reduction import DominatingSetOptions, dominating_set, keep_random_images
 
 
 @pytest.fixture(scope="module")
@@ -18,13 +17,12 @@ def narrow():
 
 @pytest.fixture(scope="module")
 def making(narrow):
-    graph, reduction = algorithm_1(narrow), ReductionOptions()
+    graph, reduction = algorithm_1(narrow), DominatingSetOptions()
     return VariantInputs(
         map=narrow,
         graph=graph,
         reduction=reduction,
         solution=dominating_set(graph, reduction, narrow),
-        weigh=weigh_map,
     )
 
 
@@ -104,7 +102,9 @@ def test_a_set_that_dominates_k_times_localizes_each_other_image_from_k(making, 
     np.fill_diagonal(adjacency, val=False)
     others = np.setdiff1d(np.arange(len(adjacency)), found)
     assert (adjacency[found][:, others].sum(axis=0) >= np.minimum(k, adjacency[:, others].sum(axis=0))).all()
-    assert len(found) == len(dominating_set(making.graph, ReductionOptions(dominators=k), making.map).chosen)
+    assert len(found) == len(
+        dominating_set(making.graph, DominatingSetOptions(dominators=k), making.map).chosen
+    )
 
 
 def test_a_budget_is_respected(making):
@@ -118,7 +118,7 @@ def test_a_stricter_threshold_takes_more_images(making):
 
 
 def test_settings_override_only_their_own_options(making):
-    strict = replace(making, reduction=ReductionOptions(threshold=1e-12))
+    strict = replace(making, reduction=DominatingSetOptions(threshold=1e-12))
     assert len(chosen(strict, "dominating:k=2")) == 10
     assert len(chosen(strict, "dominating:threshold=0.05")) == len(making.solution.chosen)
 

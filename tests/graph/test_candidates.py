@@ -8,12 +8,13 @@ import pytest
 
 from scenes import exact_map
 from slimsfm.features import Features
-from slimsfm.graph import GraphOptions, compute_graph
+from slimsfm.graph import GraphOptions, GraphRun, ReferenceGraph, compute_graph
 from slimsfm.graph.candidates import all_pairs, covisible_pairs, likely_pairs
-from slimsfm.graph.recall import estimate_recall
+from slimsfm.graph.compute import estimate_recall
 
 LIKELY = GraphOptions(edges="localize", candidates="likely")
 ALL = replace(LIKELY, candidates="all")
+MATCHED = GraphOptions(edges="matches")
 
 
 def as_set(pairs):
@@ -77,19 +78,27 @@ def test_nothing_is_missed_where_all_pairs_were_tried(exact):
     assert estimate_recall(exact, compute_graph(exact, LIKELY), LIKELY) == 1.0
 
 
-def test_the_estimated_share_of_edges_on_the_pairs_tried_is_near_the_true_one(monkeypatch):
-    """Every image localizes every other one, but only neighbours are tried: the true share is known."""
+def partly_tried(map_, count):
+    """A map of which only the first pairs have matches, and its graph by localizing just these pairs."""
+    names, pairs = tuple(map_.images), all_pairs(map_)[:count]
+    map_ = replace(map_, matches={(names[u], names[v]): np.zeros((0, 2), np.int64) for u, v in pairs})
+    both_ways = np.concatenate([pairs, pairs[:, ::-1]])
+    errors = compute_graph(map_, ALL).graph.dense()[both_ways[:, 0], both_ways[:, 1]]
+    graph = ReferenceGraph.from_errors(names, both_ways, errors)
+    return map_, GraphRun(graph=graph, pairs_tried=count, seconds={})
+
+
+def test_the_estimated_share_of_edges_on_the_pairs_tried_is_near_the_true_one():
+    """Every image localizes every other image, but only some pairs are tried: the true share is known."""
     map_, tried = exact_map(num_images=24), 24 * 23 // 2 - 60
-    monkeypatch.setattr("slimsfm.graph.localize.likely_pairs", lambda map_: all_pairs(map_)[:tried])
-    run = compute_graph(map_, LIKELY)
+    map_, run = partly_tried(map_, tried)
     truth = run.graph.num_edges() / compute_graph(map_, ALL).graph.num_edges()
-    assert run.pairs_tried == tried
     assert truth == pytest.approx(tried / 276)
-    assert estimate_recall(map_, run, LIKELY) == pytest.approx(truth)
+    assert estimate_recall(map_, run, MATCHED) == pytest.approx(truth)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_sample_of_the_skipped_pairs_tells_for_all_of_them(monkeypatch, seed):
+def test_a_sample_of_the_skipped_pairs_represents_all_of_them(seed):
     """Half of the images have descriptors of their own, so that they localize only each other."""
     map_ = exact_map(num_images=24)
     features = {
@@ -104,9 +113,7 @@ def test_a_sample_of_the_skipped_pairs_tells_for_all_of_them(monkeypatch, seed):
         for number, (name, one) in enumerate(map_.features.items())
     }
     map_ = replace(map_, features=features)
-    monkeypatch.setattr("slimsfm.graph.recall._SAMPLE", 100)
-    monkeypatch.setattr("slimsfm.graph.localize.likely_pairs", lambda map_: all_pairs(map_)[:60])
-    run = compute_graph(map_, LIKELY)
+    map_, run = partly_tried(map_, 60)
     truth = run.graph.num_edges() / compute_graph(map_, ALL).graph.num_edges()
     assert 0.1 < truth < 0.9
-    assert estimate_recall(map_, run, LIKELY, seed=seed) == pytest.approx(truth, rel=0.25)
+    assert estimate_recall(map_, run, MATCHED, sample=100, seed=seed) == pytest.approx(truth, rel=0.25)

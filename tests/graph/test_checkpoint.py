@@ -14,9 +14,9 @@ from scenes import ALGORITHM_1, algorithm_1, exact_map
 from slimsfm.errors import OutputError
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.candidates import all_pairs
-from slimsfm.graph.checkpoint import Checkpoint
-from slimsfm.graph.io import load_or_compute_graph
-from slimsfm.graph.key import graph_key
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.io import Checkpoint
+from slimsfm.graph.options import graph_key
 from slimsfm.mapping.io import read_map
 
 KEY = "0123456789abcdef" * 4
@@ -61,7 +61,7 @@ def test_half_a_record_at_the_end_is_cut_off_wherever_the_file_ends(path):
         assert path.read_bytes() == whole
 
 
-def test_progress_of_other_work_is_begun_anew(path):
+def test_progress_of_other_work_is_replaced(path):
     write(path, slice(None))
     other = KEY[::-1]
     assert stored(path, other) == ([], [])
@@ -79,7 +79,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 
 
 def left_to_do(map_, folder, options):
-    """Finish a graph and tell how many pairs were still to be localized."""
+    """Finish a graph and return how many pairs were still to be localized."""
     labels = []
 
     def watch(items, label):
@@ -92,7 +92,7 @@ def left_to_do(map_, folder, options):
 
 
 def poisoned(path, pairs, key):
-    """A checkpoint that tells of every pair what is not true."""
+    """Write a checkpoint with wrong errors of all pairs."""
     with Checkpoint(path, key) as checkpoint:
         checkpoint.append(pairs, np.full((len(pairs), 2), 123.0))
 
@@ -113,20 +113,19 @@ def test_progress_with_other_options_or_of_another_map_is_not_mixed_in(exact, tm
 
 
 SMALL_BLOCKS = """
-from slimsfm.graph import compute
-compute._BLOCK_SECONDS = 0.02
-from slimsfm.cli import main
-main()
+import sys
+from pathlib import Path
+from slimsfm.graph import GraphOptions, load_or_compute_graph
+from slimsfm.mapping.io import read_map
+path, options = Path(sys.argv[1]), GraphOptions(edges="localize", candidates="all")
+load_or_compute_graph(read_map(path), path, options, block_seconds=0.02)
 """
 
 
 def killed_when(a_map, num_records):
-    """Start the command and kill it as soon as that much is done."""
-    arguments = ("graph", a_map, "--edges", "localize", "--candidates", "all", "--workers", "1")
+    """Start a computation and kill it when this many pairs are done."""
     process = subprocess.Popen(
-        [sys.executable, "-c", SMALL_BLOCKS, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        [sys.executable, "-c", SMALL_BLOCKS, str(a_map)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     partial, deadline = a_map / "graph-localize.partial", time.monotonic() + PATIENCE_S
     while not (partial.exists() and partial.stat().st_size >= HEADER + num_records * RECORD):
@@ -138,7 +137,7 @@ def killed_when(a_map, num_records):
     assert process.returncode == -signal.SIGKILL
 
 
-def test_a_killed_command_goes_on_where_it_stopped_and_ends_with_the_same_bytes(boulder, tmp_path):
+def test_a_killed_computation_resumes_and_ends_with_the_same_bytes(boulder, tmp_path):
     a_map = shutil.copytree(boulder.map_path, tmp_path / "map", ignore=shutil.ignore_patterns("graph-*"))
     undisturbed = shutil.copytree(a_map, tmp_path / "undisturbed")
     map_ = read_map(a_map)

@@ -7,13 +7,15 @@ import pytest
 from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
-from slimsfm.graph import GraphOptions, compute
-from slimsfm.graph.io import load_or_compute_graph, read_given_graph, write_graph
-from slimsfm.graph.key import graph_key
+from slimsfm.graph import GraphOptions
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.io import read_given_graph, write_graph
+from slimsfm.graph.options import graph_key
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.pose import RansacOptions
 
+HEADER, RECORD = 65, 24  # bytes of a checkpoint
 FILES = ["graph-localize.npz"]
 
 
@@ -168,16 +170,15 @@ def test_a_graph_of_another_map_or_a_damaged_one_is_replaced(exact, tmp_path):
     assert load_or_compute_graph(part, tmp_path, ALGORITHM_1).graph.names == ("001.png", "004.png")
 
 
-def test_an_interruption_leaves_no_graph_but_its_progress(exact, tmp_path, monkeypatch):
-    monkeypatch.setattr(compute, "_BLOCK_SECONDS", 0.0)  # blocks of one pair
-    monkeypatch.setattr(compute, "_TRIAL", 2)
+def test_an_interruption_leaves_only_the_progress(exact, tmp_path):
+    one_pair = {"block_seconds": 0.0}
 
     def interrupt(items, label):
         yield items[0]
         raise KeyboardInterrupt(label)
 
     with pytest.raises(KeyboardInterrupt):
-        load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=interrupt)
+        load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=interrupt, **one_pair)
     assert [path.name for path in tmp_path.iterdir()] == ["graph-localize.partial"]
     labels = []
 
@@ -185,9 +186,10 @@ def test_an_interruption_leaves_no_graph_but_its_progress(exact, tmp_path, monke
         labels.append(label)
         return iter(items)
 
-    resumed = load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=watch)
-    left = 15 - (2 + 1) - 2  # the first run kept its trial and one block, and the second had a trial, too
-    assert labels == [f"localize {left} pairs from each other, 1 at a time"]
+    kept = ((tmp_path / "graph-localize.partial").stat().st_size - HEADER) // RECORD
+    resumed = load_or_compute_graph(exact, tmp_path, ALGORITHM_1, progress=watch, **one_pair)
+    assert kept == 9  # 8 timed pairs and one block; the second run times all that is left
+    assert labels == ["localize 0 pairs from each other, 1 at a time"]
     assert_equal_graphs(resumed.graph, algorithm_1(exact))
     assert [path.name for path in tmp_path.iterdir()] == FILES
 
@@ -211,17 +213,17 @@ def test_errors_of_another_system_are_read_from_a_table(exact, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "has not the columns reference, query, error"),
-        ("reference,image,error\n001.png,002.png,0.1\n", "has not the columns reference, query, error"),
-        (CSV + "001.png,nobody.png,0.1\n", "'nobody.png' is no image of the map"),
-        (CSV + "001.png\n", "None is no image of the map"),
+        ("", "lacks one of the columns reference, query, error"),
+        ("reference,image,error\n001.png,002.png,0.1\n", "lacks one of the columns reference, query, error"),
+        (CSV + "001.png,nobody.png,0.1\n", "'nobody.png' is not an image of the map"),
+        (CSV + "001.png\n", "None is not an image of the map"),
         (CSV + "001.png,002.png\n", "not a readable table"),
         (CSV + "001.png,002.png,small\n", "could not convert string to float: 'small'"),
         (CSV + "001.png,002.png,nan\n", "errors must be numbers from 0 to infinity"),
         (CSV + "001.png,002.png,-0.1\n", "errors must be numbers from 0 to infinity"),
         (CSV + "001.png,002.png,0.1\n001.png,002.png,0.1\n", "pairs must not repeat"),
-        (CSV + "001.png,001.png,0.1\n", "pairs must be of two different images"),
-        (CSV + "001.png,\x00,0.1\n", "not a readable table|is no image of the map"),
+        (CSV + "001.png,001.png,0.1\n", "pairs must join two different images"),
+        (CSV + "001.png,\x00,0.1\n", "not a readable table|is not an image of the map"),
     ],
 )
 def test_a_bad_table_is_named(exact, tmp_path, text, message):

@@ -7,7 +7,7 @@ import pytest
 from scenes import ALGORITHM_1, algorithm_1, exact_map, graph_from_dense
 from slimsfm.features import unit_rows
 from slimsfm.geometry import corner_error
-from slimsfm.graph import compute, compute_graph
+from slimsfm.graph import GraphWork, compute_graph
 from slimsfm.mapping.subset import keep_images
 from slimsfm.pose import RansacOptions
 
@@ -78,8 +78,7 @@ def test_a_threshold_is_exclusive_and_changes_only_the_decisions():
     assert [graph.num_edges(t) for t in (0.01, 0.02, 0.03, 0.05, 0.051, 0.1, 1.0)] == [0, 0, 1, 2, 3, 4, 5]
 
 
-def test_progress_sees_each_block_of_work(exact, monkeypatch):
-    monkeypatch.setattr(compute, "_BLOCK_SECONDS", 0.0)  # blocks of one pair
+def test_progress_sees_each_block_of_work(exact):
     seen = []
 
     def watch(items, label):
@@ -87,13 +86,16 @@ def test_progress_sees_each_block_of_work(exact, monkeypatch):
             seen.append(label)
             yield item
 
-    compute_graph(exact, ALGORITHM_1, progress=watch)
-    untimed = 6 * 5 // 2 - compute._TRIAL
+    compute_graph(exact, ALGORITHM_1, GraphWork(block_seconds=0.0), progress=watch)  # blocks of one pair
+    untimed = 6 * 5 // 2 - TIMED_PAIRS
     assert seen == [f"localize {untimed} pairs from each other, 1 at a time"] * untimed
 
 
+TIMED_PAIRS = 8  # localized first, to choose the size of the blocks
+
+
 def opencv_matches(query, reference):
-    """Mutual nearest neighbours that pass Lowe's ratio test, by OpenCV's matcher."""
+    """Mutual nearest neighbors that pass Lowe's ratio test, by OpenCV's matcher."""
     angle = lambda match: 2 * np.arcsin(min(1.0, match.distance / 2))  # noqa: E731
     mutual = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(query, reference)
     mutual = {(match.queryIdx, match.trainIdx) for match in mutual}

@@ -51,9 +51,9 @@ def test_a_pair_that_is_not_given_has_no_pose():
     [
         ([(0, 1)], [np.nan], "errors must be numbers from 0 to infinity"),
         ([(0, 1)], [-1e-9], "errors must be numbers from 0 to infinity"),
-        ([(0, 3)], [0.1], "pairs must be of images 0 to 2, got 0 and 3"),
-        ([(-1, 0)], [0.1], "pairs must be of images 0 to 2, got -1 and 0"),
-        ([(1, 1)], [0.1], "pairs must be of two different images"),
+        ([(0, 3)], [0.1], "pairs must be from 0 to 2, got 0 and 3"),
+        ([(-1, 0)], [0.1], "pairs must be from 0 to 2, got -1 and 0"),
+        ([(1, 1)], [0.1], "pairs must join two different images"),
         ([(0, 1), (1, 0), (0, 1)], [0.1, 0.1, np.inf], "pairs must not repeat"),
     ],
 )

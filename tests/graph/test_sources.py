@@ -10,10 +10,8 @@ import pytest
 from scenes import exact_map, with_matches
 from slimsfm.errors import InputError
 from slimsfm.graph import EDGE_SOURCES, EdgeSource, GraphOptions, compute_graph
-from slimsfm.graph.hybrid import HybridEdges
-from slimsfm.graph.localize import LocalizeEdges
-from slimsfm.graph.matches import MatchEdges
-from slimsfm.graph.source import edge_source, resolve
+from slimsfm.graph.edge_sources import HybridEdges, LocalizeEdges, MatchEdges
+from slimsfm.graph.options import edge_source, resolve_edges
 from slimsfm.mapping.subset import keep_images
 
 EXACT = 1e-4
@@ -132,18 +130,18 @@ def test_tracks_need_no_matches_and_no_features():
 
 
 def test_auto_is_matches_or_tracks_where_there_are_none(exact):
-    assert resolve(exact, OPTIONS) == "matches"
+    assert resolve_edges(exact, OPTIONS) == "matches"
     assert isinstance(edge_source(exact, OPTIONS), MatchEdges)
     bare = replace(exact, matches={})
-    assert resolve(bare, OPTIONS) == "tracks"
-    assert [resolve(exact, GraphOptions(edges=edges)) for edges in EDGE_SOURCES] == list(EDGE_SOURCES)
-    with pytest.raises(InputError, match="no matches; use --edges tracks or localize"):
+    assert resolve_edges(bare, OPTIONS) == "tracks"
+    assert [resolve_edges(exact, GraphOptions(edges=edges)) for edges in EDGE_SOURCES] == list(EDGE_SOURCES)
+    with pytest.raises(InputError, match="no matches; set edges to tracks or localize"):
         edge_source(bare, GraphOptions(edges="matches"))
 
 
 @pytest.fixture
 def localized(monkeypatch):
-    """The edges (reference, query) that are decided by matching anew."""
+    """The edges (reference, query) that are decided by matching again."""
     edges = []
     localize = LocalizeEdges.error
 
@@ -170,14 +168,14 @@ def test_hybrid_localizes_what_sees_common_points_but_has_no_matches(exact, loca
 
 def test_hybrid_looks_closer_at_missing_poses_and_at_errors_near_the_threshold(boulder, localized):
     map_, options = boulder.map, GraphOptions(edges="hybrid", threshold=0.02)
-    hybrid, matched, anew = (make(map_, options) for make in (HybridEdges, MatchEdges, LocalizeEdges))
+    hybrid, matched, again = (make(map_, options) for make in (HybridEdges, MatchEdges, LocalizeEdges))
     matched_pairs = {tuple(pair) for pair in matched.pairs().tolist()}
     decided = 0
     for u, v in hybrid.pairs()[::3].tolist():
         found = as_tuple(hybrid.errors(u, v))
         asked = localized.copy()
         by_matches = as_tuple(matched.errors(u, v)) if (u, v) in matched_pairs else (np.inf, np.inf)
-        by_localizing = as_tuple(anew.errors(u, v))
+        by_localizing = as_tuple(again.errors(u, v))
         is_open = [error == np.inf or 0.01 <= error <= 0.04 for error in by_matches]
         assert asked == [edge for edge, open_ in zip([(u, v), (v, u)], is_open, strict=True) if open_]
         assert found == tuple(np.where(is_open, by_localizing, by_matches))

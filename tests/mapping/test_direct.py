@@ -172,7 +172,7 @@ def test_keeping_images_of_a_map_for_both_ways_drops_the_points(partial):
         ),
         lambda map_: Localizer(map_, LocalizationOptions(strategy="exhaustive")),
         lambda map_: keep_images(map_, list(map_.images)[:2]),
-        lambda map_: frontier(map_, None, lambda _: 0, FrontierOptions(uses=("direct",))),
+        lambda map_: frontier(map_, FrontierOptions(uses=("direct",))),
     ],
     ids=["auto", *EDGE_SOURCES, "exhaustive", "keep_images", "frontier"],
 )

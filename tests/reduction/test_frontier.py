@@ -1,4 +1,4 @@
-"""What many ways to reduce a map cost, told beforehand."""
+"""What many ways to reduce a map keep and are predicted to lose."""
 
 from dataclasses import replace
 
@@ -9,10 +9,19 @@ from scenes import algorithm_1, exact_map
 from slimsfm.domination import dominates
 from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
-from slimsfm.mapping.io import bytes_by_part, write_map
+from slimsfm.graph import GraphOptions, compute_graph
+from slimsfm.mapping.io import bytes_by_part, weigh_map, write_map
 from slimsfm.mapping.map import check_map
 from slimsfm.mapping.subset import keep_images
-from slimsfm.reduction import USES, FrontierOptions, Maker, frontier, points_seen, try_images
+from slimsfm.reduction import (
+    USES,
+    FrontierOptions,
+    ReductionLimits,
+    apply_choice,
+    forecast_images,
+    frontier,
+    points_seen,
+)
 from slimsfm.selection import SELECTORS
 
 BUDGETS = (15, 40)
@@ -21,7 +30,7 @@ FEW = FrontierOptions(uses=USES, budgets=BUDGETS, dominators=(1, 2), rim=(False,
 
 @pytest.fixture(scope="module")
 def narrow():
-    """Ten images that see some of the points each, no two of their descriptors quite equal."""
+    """Ten images that see some of the points each, with slightly different descriptors."""
     map_, rng = exact_map(num_images=10, num_points=90, reach_deg=65), np.random.default_rng(0)
     features = {
         name: replace(
@@ -38,19 +47,8 @@ def graph(narrow):
 
 
 @pytest.fixture(scope="module")
-def weigh(tmp_path_factory):
-    path = tmp_path_factory.mktemp("weigh") / "map"
-
-    def weighed(map_):
-        write_map(map_, path, overwrite=True)
-        return bytes_by_part(path)["total"]
-
-    return weighed
-
-
-@pytest.fixture(scope="module")
-def found(narrow, graph, weigh):
-    return frontier(narrow, graph, weigh, FEW)
+def found(narrow, graph):
+    return frontier(narrow, FEW, graph=graph)
 
 
 def of(found, use, *methods):
@@ -81,9 +79,8 @@ def test_images_are_dominating_sets_and_their_points_are_listed_for_both_uses(na
 
 
 def test_bytes_are_those_of_the_map_that_is_made(narrow, found, tmp_path):
-    maker = Maker(narrow)
     for number, one in enumerate(found.candidates):
-        made = maker.make(one.choice)
+        made = apply_choice(narrow, one.choice)
         check_map(made)
         write_map(made, tmp_path / str(number))
         assert one.bytes == bytes_by_part(tmp_path / str(number))["total"]
@@ -108,8 +105,8 @@ def test_more_points_weigh_more_and_have_more_inliers(found):
         assert few.prediction.inliers.mean() < many.prediction.inliers.mean()
 
 
-def test_equal_maps_have_equal_frontiers(narrow, graph, weigh, found):
-    again = frontier(narrow, graph, weigh, FEW)
+def test_equal_maps_have_equal_frontiers(narrow, graph, found):
+    again = frontier(narrow, FEW, graph=graph)
     assert np.array_equal(again.full.errors, found.full.errors)
     assert len(again.candidates) == len(found.candidates)
     for a, b in zip(again.candidates, found.candidates, strict=True):
@@ -122,26 +119,50 @@ def test_equal_maps_have_equal_frontiers(narrow, graph, weigh, found):
 
 
 @pytest.mark.parametrize("uses", [("direct",), ("images",)])
-def test_only_what_it_is_for_is_tried(narrow, graph, weigh, found, uses):
-    some = frontier(narrow, graph, weigh, replace(FEW, uses=uses, budgets=(15,), dominators=(1,)))
+def test_only_what_it_is_for_is_tried(narrow, graph, found, uses):
+    some = frontier(narrow, replace(FEW, uses=uses, budgets=(15,), dominators=(1,)), graph=graph)
     assert {one.choice.use for one in some.candidates} == set(uses)
     assert np.array_equal(some.full.errors, found.full.errors)
 
 
-def test_points_need_no_graph(narrow, weigh):
+def test_points_need_no_graph(narrow):
     options = replace(FEW, uses=("direct",), budgets=(15,), selectors=tuple(SELECTORS))
-    some = frontier(narrow, None, weigh, options)
+    some = frontier(narrow, options, graph=forbidden)
     assert [one.choice.method for one in some.candidates] == list(SELECTORS)
 
 
-def test_images_need_one(narrow, weigh):
-    with pytest.raises(ValueError, match="graph must be given where images are to be chosen"):
-        frontier(narrow, None, weigh, FEW)
+def forbidden(_map, _options):
+    raise AssertionError("the graph is not needed")
 
 
-def test_budgets_beyond_all_usable_points_are_tried_once(narrow, weigh):
+@pytest.mark.parametrize("given", [None, lambda map_, options: compute_graph(map_, options).graph])
+def test_images_need_a_graph_which_is_computed_or_requested(narrow, given):
+    options = replace(FEW, uses=("images",), edges="localize")
+    some = frontier(narrow, options, graph=given)
+    expected = frontier(narrow, options, graph=compute_graph(narrow, GraphOptions(edges="localize")).graph)
+    assert [one.choice.images for one in some.candidates] == [
+        one.choice.images for one in expected.candidates
+    ]
+
+
+def test_limits_that_no_choice_meets_are_refused_before_anything_is_predicted(narrow):
+    labels = []
+
+    def watch(items, label):
+        labels.append(label)
+        return iter(items)
+
+    options = replace(FEW, uses=("direct",), selectors=("kcover",))
+    with pytest.raises(
+        InputError, match=r"no choice for direct meets max_bytes 10; the nearest, kcover \(15 po"
+    ):
+        frontier(narrow, options, limits=ReductionLimits(max_bytes=10.0), progress=watch)
+    assert "predict losses" not in labels
+
+
+def test_budgets_beyond_all_usable_points_are_tried_once(narrow):
     options = FrontierOptions(uses=("direct",), budgets=(2000, 50, 1000, 50), selectors=("kcover",))
-    sizes = [len(one.choice.points) for one in frontier(narrow, None, weigh, options).candidates]
+    sizes = [len(one.choice.points) for one in frontier(narrow, options).candidates]
     assert sizes[0] == 50
     assert len(sizes) == 2
     assert 50 < sizes[1] <= len(narrow.point3D_ids)
@@ -164,19 +185,19 @@ def test_bad_options(options, message):
         FrontierOptions(**options)
 
 
-def test_images_that_are_named_are_tried(narrow, weigh):
+def test_images_that_are_named_are_tried(narrow):
     names = ["004.png", "001.png", "004.png"]
-    one = try_images(narrow, names, weigh)
+    one = forecast_images(narrow, names)
     assert one.choice.images == ("001.png", "004.png")
     assert np.array_equal(one.choice.points, points_seen(narrow, one.choice.images))
-    assert one.bytes == weigh(keep_images(narrow, names))
+    assert one.bytes == weigh_map(keep_images(narrow, names))
     assert set(one.prediction.tests) == set(narrow.images) - set(names)
     assert one.full.tests == one.prediction.tests
-    with pytest.raises(InputError, match="'nobody"):
-        try_images(narrow, ["nobody.png"], weigh)
+    with pytest.raises(InputError, match="'missing"):
+        forecast_images(narrow, ["missing.png"])
 
 
-def test_where_all_images_are_kept_there_are_no_tests(narrow, weigh):
-    one = try_images(narrow, list(narrow.images), weigh)
+def test_where_all_images_are_kept_there_are_no_tests(narrow):
+    one = forecast_images(narrow, list(narrow.images))
     assert one.prediction.tests == one.full.tests == ()
     assert one.loss == 0.0

@@ -9,13 +9,14 @@ from scenes import algorithm_1, exact_map, graph_from_dense
 from slimsfm.domination import SOLVERS, DominationProblem, dominates
 from slimsfm.errors import InputError
 from slimsfm.mapping.map import check_map
-from slimsfm.reduction.images import (
-    ReductionOptions,
+from slimsfm.mapping.subset import keep_images
+from slimsfm.reduction import ImageOptions, ReduceOptions, reduce
+from slimsfm.reduction.image_sets import (
+    DominatingSetOptions,
     dominating_set,
     image_order,
     images_within,
     keep_random_images,
-    reduce_map,
 )
 from slimsfm.reduction.rim import rim_groups
 
@@ -46,8 +47,18 @@ every_solver = pytest.mark.parametrize(
 )
 
 
+def options_of(*, seed=0, **options):
+    return ReduceOptions(image_choice=ImageOptions(**options), seed=seed)
+
+
 def chosen_by(graph, map_=None, **options):
-    return dominating_set(graph, ReductionOptions(**options), map_).chosen
+    return dominating_set(graph, DominatingSetOptions(**options), map_).chosen
+
+
+def reduced_by(map_, graph, **options):
+    """The map of a dominating set, as `reduce` makes it."""
+    chosen = dominating_set(graph, DominatingSetOptions(**options), map_).chosen
+    return keep_images(map_, (graph.names[i] for i in chosen))
 
 
 def total_error(graph, chosen):
@@ -56,10 +67,10 @@ def total_error(graph, chosen):
 
 @every_solver
 def test_kept_images_are_those_of_the_solver_and_localize_all_others(narrow, narrow_graph, solver):
-    reduction = reduce_map(narrow, narrow_graph, ReductionOptions(solver=solver, seed=3))
-    chosen = reduction.solution.chosen
+    chosen = chosen_by(narrow_graph, narrow, solver=solver, seed=3)
     assert len(chosen) == len(SOLVERS[solver](DominationProblem(narrow_graph.adjacency()), seed=3).chosen)
-    assert list(reduction.map.images) == [narrow_graph.names[i] for i in chosen]
+    kept = reduce(narrow, options_of(solver=solver, seed=3), graph=narrow_graph).map
+    assert list(kept.images) == [narrow_graph.names[i] for i in chosen]
     assert dominates(narrow_graph.adjacency(), chosen)
     as_networkx = nx.from_scipy_sparse_array(narrow_graph.adjacency(), create_using=nx.DiGraph)
     assert nx.is_dominating_set(as_networkx, chosen)
@@ -67,7 +78,7 @@ def test_kept_images_are_those_of_the_solver_and_localize_all_others(narrow, nar
 
 
 def test_kept_points_are_those_that_kept_images_see(narrow, narrow_graph):
-    slim = reduce_map(narrow, narrow_graph).map
+    slim = reduce(narrow, options_of(solver="exact"), graph=narrow_graph).map
     check_map(slim)
     seen = {i for name in slim.images for i in narrow.point3D_ids[narrow.observations[name].points].tolist()}
     assert set(slim.point3D_ids.tolist()) == seen
@@ -81,7 +92,7 @@ def test_kept_points_are_those_that_kept_images_see(narrow, narrow_graph):
 def test_every_image_keeps_a_kept_one_that_localizes_it(exact, solver, seed):
     graph = random_graph(exact.images, seed)
     for threshold in (0.03, 0.05, 0.1):
-        slim = reduce_map(exact, graph, ReductionOptions(threshold=threshold, solver=solver)).map
+        slim = reduced_by(exact, graph, threshold=threshold, solver=solver)
         kept = [graph.names.index(name) for name in slim.images]
         errors = graph.dense()
         for v in range(len(graph.names)):
@@ -92,8 +103,7 @@ def test_every_image_keeps_a_kept_one_that_localizes_it(exact, solver, seed):
 def test_a_larger_threshold_never_needs_more_images(exact, seed):
     graph = random_graph(exact.images, seed)
     sizes = [
-        len(reduce_map(exact, graph, ReductionOptions(threshold=threshold)).solution.chosen)
-        for threshold in (0.001, 0.03, 0.05, 0.06, 0.5, 1.0)
+        len(chosen_by(graph, exact, threshold=threshold)) for threshold in (0.001, 0.03, 0.05, 0.06, 0.5, 1.0)
     ]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[0] == len(exact.images)
@@ -101,7 +111,7 @@ def test_a_larger_threshold_never_needs_more_images(exact, seed):
 
 def test_the_exact_solver_is_never_beaten(narrow, narrow_graph):
     exact, drawn = (
-        reduce_map(narrow, narrow_graph, ReductionOptions(solver=solver)).solution
+        dominating_set(narrow_graph, DominatingSetOptions(solver=solver), narrow)
         for solver in ("exact", "random")
     )
     assert exact.is_optimal
@@ -112,7 +122,7 @@ def test_the_exact_solver_is_never_beaten(narrow, narrow_graph):
 def test_the_paper_s_solver_is_left_as_it_is(exact, seed):
     graph = random_graph(exact.images, seed)
     plain = SOLVERS["random"](DominationProblem(graph.adjacency()), seed=seed)
-    assert dominating_set(graph, ReductionOptions(solver="random", seed=seed, best=True)) == plain
+    assert dominating_set(graph, DominatingSetOptions(solver="random", seed=seed, best=True)) == plain
 
 
 @every_solver
@@ -122,7 +132,9 @@ def test_of_sets_of_one_size_one_with_small_errors_is_taken(solver, seed):
         return
     graph = random_graph([f"{i:02d}" for i in range(20)], seed)
     plain = SOLVERS[solver](DominationProblem(graph.adjacency()))
-    ours, best = (dominating_set(graph, ReductionOptions(solver=solver, best=best)) for best in (False, True))
+    ours, best = (
+        dominating_set(graph, DominatingSetOptions(solver=solver, best=best)) for best in (False, True)
+    )
     assert ours.cost == plain.cost == best.cost == len(ours.chosen)
     assert ours.is_optimal == plain.is_optimal
     assert total_error(graph, ours.chosen) <= total_error(graph, plain.chosen)
@@ -144,17 +156,17 @@ def test_each_dropped_image_keeps_as_many_kept_ones_that_localize_it_as_it_can(e
 def test_a_limit_on_images_is_kept_and_one_that_suffices_changes_nothing(narrow, narrow_graph):
     plain = chosen_by(narrow_graph)
     for limit in range(1, 11):
-        found = dominating_set(narrow_graph, ReductionOptions(max_images=limit))
+        found = dominating_set(narrow_graph, DominatingSetOptions(max_images=limit))
         assert len(found.chosen) <= limit
         assert (found.unmet == 0) == (limit >= len(plain))
         if limit >= len(plain):
             assert found.chosen == plain
-    assert len(reduce_map(narrow, narrow_graph, ReductionOptions(max_images=1)).map.images) == 1
+    assert len(reduced_by(narrow, narrow_graph, max_images=1).images) == 1
 
 
 def test_costs_of_observations_make_images_with_fewer_of_them_preferred(narrow, narrow_graph):
     sizes = np.array([len(seen.rows) for seen in narrow.observations.values()])
-    cheapest = dominating_set(narrow_graph, ReductionOptions(cost="observations"), narrow)
+    cheapest = dominating_set(narrow_graph, DominatingSetOptions(cost="observations"), narrow)
     assert cheapest.cost == sizes[list(cheapest.chosen)].sum() <= sizes[list(chosen_by(narrow_graph))].sum()
     assert cheapest.is_optimal
 
@@ -165,7 +177,7 @@ def test_with_the_rim_every_group_keeps_an_image_at_no_fewer_images(narrow, narr
     kept = chosen_by(narrow_graph, narrow, solver=solver, rim=True)
     assert groups[:, list(kept)].any(axis=1).all()
     assert dominates(narrow_graph.adjacency(), kept)
-    assert len(kept) >= dominating_set(narrow_graph, ReductionOptions()).lower_bound
+    assert len(kept) >= dominating_set(narrow_graph, DominatingSetOptions()).lower_bound
 
 
 @pytest.mark.parametrize("options", [{"rim": True}, {"cost": "observations"}], ids=str)
@@ -177,7 +189,7 @@ def test_what_needs_the_map_says_so(narrow_graph, options):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_order_starts_with_the_dominating_set_and_has_every_image_once(exact, seed):
     graph = random_graph(exact.images, seed)
-    order = image_order(graph, ReductionOptions())
+    order = image_order(graph, DominatingSetOptions())
     kept = {graph.names[i] for i in chosen_by(graph)}
     assert set(order[: len(kept)]) == kept
     assert sorted(order) == list(graph.names)
@@ -204,8 +216,8 @@ def test_a_graph_of_another_map_is_refused(exact, change):
         "fewer": tuple(exact.images)[:-1],
     }[change]
     graph = graph_from_dense(names, np.zeros((len(names), len(names))))
-    with pytest.raises(ValueError, match="graph must be of this map"):
-        reduce_map(exact, graph)
+    with pytest.raises(ValueError, match="graph must have the images of this map"):
+        dominating_set(graph, DominatingSetOptions(), exact)
 
 
 def test_random_images_follow_the_seed(exact):
@@ -237,4 +249,4 @@ def test_all_images_can_be_drawn_but_not_more_nor_none(exact):
 )
 def test_bad_options_are_named(values, message):
     with pytest.raises(ValueError, match=message):
-        replace(ReductionOptions(), **values)
+        replace(DominatingSetOptions(), **values)

@@ -16,11 +16,11 @@ from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, Object
 from slimsfm.evaluation.variants import VariantInputs, parse_variant
 from slimsfm.geometry import project
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
-from slimsfm.reduction import ReductionOptions, dominating_set
+from slimsfm.reduction import DominatingSetOptions, dominating_set
 
 _OPTIONS = BenchmarkOptions(strategies=("exhaustive", "direct"))
 _HARD = 14  # keypoints of the last query, which slim maps do not localize
@@ -51,10 +51,8 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
     write_map(keep_images(truth, [one for one in names if one not in asked]), base / "full")
     full = read_map(base / "full")
     graph = load_or_compute_graph(full, base / "full", GraphOptions(edges="localize", candidates="all")).graph
-    solution = dominating_set(graph, ReductionOptions(), full)
-    making = VariantInputs(
-        map=full, graph=graph, reduction=ReductionOptions(), solution=solution, weigh=weigh_map
-    )
+    solution = dominating_set(graph, DominatingSetOptions(), full)
+    making = VariantInputs(map=full, graph=graph, reduction=DominatingSetOptions(), solution=solution)
     queries = [_query(truth, photos, one) for one in asked]
     prepared = [_prepared(query, truth, hard=query is queries[-1]) for query in queries]
     stored = {variant: _stored(making, variant, base) for variant in _OPTIONS.variants}

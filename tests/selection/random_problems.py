@@ -14,7 +14,7 @@ def motions(in_cam: np.ndarray) -> np.ndarray:
 
 
 def problem_of(uses: np.ndarray, seed: int = 0) -> SelectionProblem:
-    """The problem of a dense matrix of who uses what, seen by cameras of focal length 500."""
+    """The problem of a dense matrix of uses, seen by cameras of focal length 500."""
     rng = np.random.default_rng(seed)
     x, y, z = in_cam = rng.uniform([[-0.5], [-0.5], [1]], [[0.5], [0.5], [2]], (3, uses.size))
     zero = np.zeros_like(x)
@@ -38,7 +38,7 @@ def reordered(problem: SelectionProblem, images: np.ndarray) -> SelectionProblem
 
 
 def users(problem: SelectionProblem) -> np.ndarray:
-    """Who uses what, dense."""
+    """The uses as a dense matrix [images, points]."""
     return problem.usable.toarray().astype(bool)
 
 

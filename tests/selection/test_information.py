@@ -11,8 +11,8 @@ from selection.random_problems import problem_of, problems, users
 from slimsfm.geometry import project
 from slimsfm.pose import RansacOptions, estimate_pose, rms_corner_errors
 from slimsfm.selection import information
-from slimsfm.selection.information import _Choice
 from slimsfm.selection.leave_one_out import LeftOut
+from slimsfm.selection.pose_information import InformationChoice
 from slimsfm.selection.problem import PRIOR_SIGMA
 from slimsfm.selection.usable_points import selection_problem
 
@@ -34,8 +34,8 @@ def predicted(problem, image, points):
     return np.sqrt((moved.reshape(8, -1) ** 2).sum(axis=1).mean())
 
 
-def told(problem, points):
-    """What the selector maximizes while no image is satisfied, from the definition."""
+def value_of(problem, points):
+    """The objective of the selector while no image is satisfied, by the definition."""
     total = 0.0
     for image, uses in enumerate(users(problem)):
         rows = rows_of(problem, image, points)
@@ -69,21 +69,21 @@ def test_more_points_never_raise_a_predicted_error(problem, data):
 
 @quick
 @given(problem=problems(max_points=12), data=st.data())
-def test_the_more_is_chosen_the_less_a_further_point_tells(problem, data):
+def test_the_value_of_a_further_point_falls_with_the_number_chosen(problem, data):
     fewer = some_points(data, problem)
     more = fewer | some_points(data, problem)
     for point in set(range(problem.num_points)) - more:
-        to_fewer = told(problem, fewer | {point}) - told(problem, fewer)
-        to_more = told(problem, more | {point}) - told(problem, more)
+        to_fewer = value_of(problem, fewer | {point}) - value_of(problem, fewer)
+        to_more = value_of(problem, more | {point}) - value_of(problem, more)
         assert -1e-9 <= to_more <= to_fewer + 1e-9
 
 
 @quick
 @given(problem=problems(), cover=st.integers(1, 12))
 def test_an_image_is_satisfied_with_its_number_of_points_and_its_target(problem, cover):
-    choice = _Choice(problem)
+    choice = InformationChoice(problem)
     choice.extend(cover, problem.num_points)
-    chosen, usable = np.array(choice.chosen, np.int64), problem.points_an_image
+    chosen, usable = np.array(choice.chosen, np.int64), problem.points_per_image
     assert (users(problem)[:, chosen].sum(axis=1) >= np.minimum(cover, usable)).all()
     target = problem.best_corner_errors * np.sqrt(np.maximum(usable / cover, 1))
     assert (problem.corner_errors(chosen) <= target * (1 + 1e-5)).all()
@@ -92,10 +92,10 @@ def test_an_image_is_satisfied_with_its_number_of_points_and_its_target(problem,
 @quick
 @given(problem=problems(), cover=st.integers(1, 12))
 def test_the_last_point_chosen_was_needed(problem, cover):
-    choice = _Choice(problem)
+    choice = InformationChoice(problem)
     if choice.extend(cover, problem.num_points) == 0:
         return
-    without, usable = np.array(choice.chosen[:-1], np.int64), problem.points_an_image
+    without, usable = np.array(choice.chosen[:-1], np.int64), problem.points_per_image
     few = users(problem)[:, without].sum(axis=1) < np.minimum(cover, usable)
     target = problem.best_corner_errors * np.sqrt(np.maximum(usable / cover, 1))
     assert (few | (problem.corner_errors(without) > target)).any()
@@ -103,25 +103,27 @@ def test_the_last_point_chosen_was_needed(problem, cover):
 
 @settings(deadline=None, max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 4))
-def test_greedy_tells_as_much_as_its_bound_promises_of_the_best_set(seed, count):
+def test_greedy_reaches_its_guaranteed_share_of_the_best_set(seed, count):
     rng = np.random.default_rng(seed)
-    uses = np.ones((3, 10), bool)  # so many that no image is satisfied by `count` of them
+    uses = np.ones((3, 10), bool)  # dense: no image is satisfied by `count` points
     for row in uses:
         row[rng.permutation(10)[: rng.integers(0, 5)]] = False
     problem = problem_of(uses, seed)
-    best = max(told(problem, points) for points in combinations(range(10), count))
-    ours = told(problem, information(problem, count).tolist())
+    best = max(value_of(problem, points) for points in combinations(range(10), count))
+    ours = value_of(problem, information(problem, count).tolist())
     assert (1 - 1 / np.e) * best <= ours <= best + 1e-9
 
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_each_choice_is_the_one_that_tells_most_while_no_image_is_satisfied(seed):
+def test_each_choice_has_the_largest_value_while_no_image_is_satisfied(seed):
     problem = problem_of(np.random.default_rng(seed).random((4, 25)) < 0.7, seed)
     chosen = information(problem, 5).tolist()
     for step, point in enumerate(chosen):
-        gains = [told(problem, [*chosen[:step], other]) for other in range(25) if other not in chosen[:step]]
-        assert told(problem, [*chosen[:step], point]) == pytest.approx(max(gains), abs=1e-6)
+        gains = [
+            value_of(problem, [*chosen[:step], other]) for other in range(25) if other not in chosen[:step]
+        ]
+        assert value_of(problem, [*chosen[:step], point]) == pytest.approx(max(gains), abs=1e-6)
 
 
 @pytest.mark.parametrize("kept", [15, 40, 120])

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from selection.random_problems import problem_of, problems, users
 from slimsfm.selection import kcover
-from slimsfm.selection.kcover import KCover
+from slimsfm.selection.baselines import KCover
 from slimsfm.selection.problem import most_cover
 
 quick = settings(deadline=None, max_examples=40)
@@ -41,7 +41,7 @@ def test_the_greedy_cover_covers_and_is_within_its_bound_of_the_smallest(problem
 @quick
 @given(problem=problems(), count=st.integers(1, 40))
 def test_the_budget_is_spent_on_a_cover_that_fits_when_the_next_does_not(problem, count):
-    chosen, most = kcover(problem, count).tolist(), int(problem.points_an_image.max(initial=0))
+    chosen, most = kcover(problem, count).tolist(), int(problem.points_per_image.max(initial=0))
     sets = [greedy(problem, cover) for cover in range(most + 1)]
     assert any(
         len(sets[cover]) <= count
@@ -56,10 +56,10 @@ def test_the_budget_is_spent_on_a_cover_that_fits_when_the_next_does_not(problem
 def test_no_set_of_points_covers_more_than_the_bound(problem, count):
     uses = users(problem)
     bound = most_cover(problem, count)
-    if bound < problem.points_an_image.max(initial=0):
+    if bound < problem.points_per_image.max(initial=0):
         assert smallest_size(uses, bound + 1) > count
     else:
-        assert bound == problem.points_an_image.max(initial=0)
+        assert bound == problem.points_per_image.max(initial=0)
 
 
 def test_the_point_that_most_images_use_comes_first_and_ties_go_to_the_lower():

@@ -72,7 +72,7 @@ def test_count_must_be_positive(select, count):
         select(problem_of(np.ones((2, 3), bool)), count)
 
 
-@pytest.mark.parametrize("name", ["information", "kcover", "probabilistic"])
+@pytest.mark.parametrize("name", ["information", "kcover"])
 def test_an_image_apart_gets_its_share_however_few_its_points(name):
     uses = np.zeros((10, 100), bool)
     uses[:9, :90] = uses[9, 90:] = True

@@ -1,4 +1,4 @@
-"""Words and tables about ways to reduce a map."""
+"""What `reduce` and `frontier` share: the kept reference graph, sentences and tables."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,15 +6,58 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
+from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.output import console, counts, size
+from slimsfm.errors import InputError
 from slimsfm.geometry import ADD_FRACTIONS
-from slimsfm.mapping.io import bytes_by_part
+from slimsfm.graph import GraphOptions, ReferenceGraph, load_or_compute_graph
+from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
-from slimsfm.reduction import Candidate, Frontier, Prediction
+from slimsfm.progress import shown
+from slimsfm.reduction import Candidate, Frontier, GraphProvider, Prediction, Reduced, ReduceOptions
+from slimsfm.reduction.pareto import check_reducible
+
+
+def read_reducible(path: Path) -> Map:
+    """Read a map that is to be reduced.
+
+    Raises:
+        InputError: The map has no features or fewer than two images.
+    """
+    full = read_map(path)
+    try:
+        check_reducible(full)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return full
+
+
+def kept_graph(path: Path, execution: Execution) -> GraphProvider:
+    """Read or compute the reference graph of the map at a path, and keep it there."""
+
+    def find(map: Map, options: GraphOptions) -> ReferenceGraph:
+        with resumable():
+            return load_or_compute_graph(map, path, options, execution.open_executor(), shown).graph
+
+    return find
+
+
+def print_dominating_set(reduced: Reduced, options: ReduceOptions) -> None:
+    """Print the size of a requested dominating set, and whether it is the smallest."""
+    graph, solution = reduced.graph, reduced.solution
+    if graph is None or solution is None:
+        return
+    edges = graph.num_edges(options.image_choice.set_options().threshold)
+    proof = "proven smallest" if solution.is_cheapest else f"at least {solution.lower_bound} are needed"
+    unmet = f"; {solution.unmet} images are localized by too few" if solution.unmet else ""
+    console.print(
+        f"reference graph: {edges} edges among {len(graph.names)} images; "
+        f"dominating set: {len(solution.chosen)} images ({proof}){unmet}"
+    )
 
 
 def print_change(full_path: Path, full: Map, slim_path: Path, slim: Map) -> None:
-    """A table of what a map holds before and after."""
+    """Print a table of the contents of a map before and after its reduction."""
     before = {**counts(full), "bytes": bytes_by_part(full_path)["total"]}
     after = {**counts(slim), "bytes": bytes_by_part(slim_path)["total"]}
     table = Table(box=None, header_style="bold", pad_edge=False)
@@ -28,7 +71,7 @@ def print_change(full_path: Path, full: Map, slim_path: Path, slim: Map) -> None
 
 
 def promise(full_path: Path, full: Map, candidate: Candidate) -> str:
-    """What was kept and what it is predicted to do, in one sentence."""
+    """Say in one sentence what is kept and how it is predicted to localize."""
     choice, tests = candidate.choice, len(candidate.prediction.tests)
     before = f"{len(full.images)} images, {len(full.point3D_ids)} points, "
     before += size(bytes_by_part(full_path)["total"])
@@ -45,7 +88,7 @@ def promise(full_path: Path, full: Map, candidate: Candidate) -> str:
 
 
 def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], full_bytes: int) -> None:
-    """The table of all candidates: what is dominated is dim, what is recommended bold."""
+    """Print the table of all candidates: Pareto-dominated ones dim, recommended ones bold."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     for column in ("for", "method", "asked for"):
         table.add_column(column)
@@ -62,9 +105,10 @@ def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], ful
         table.add_row(*what, *weight, *_figures(one.prediction, one.loss), remark, style=style)
     console.print(table)
     console.print(
-        f"0.1d, 0.05d, 0.02d: % of up to {len(frontier.full.tests)} images, left out and handicapped, with "
-        "box corners off by less than this share of the diagonal d; loss: most points lost against the full "
-        "map on the same images; dominated: another for the same use is no larger and loses no more",
+        f"0.1d, 0.05d, 0.02d: % of {len(frontier.full.tests)} images or fewer, left out and given fewer "
+        "matches, whose mean corner error is below this share of the diagonal d; loss: percentage points "
+        "lost against the full map on the same images, the largest of the three; Pareto-dominated: another "
+        "choice for the same use is not larger and loses no more",
         style="dim",
     )
 
@@ -79,13 +123,13 @@ def _remark(
 ) -> tuple[str, str | None]:
     if any(best is one for best in recommended.values()):
         return "recommended", "bold"
-    return ("dominated", "dim") if frontier.is_dominated(one) else ("", None)
+    return ("Pareto-dominated", "dim") if frontier.is_pareto_dominated(one) else ("", None)
 
 
 def frontier_to_json(
     frontier: Frontier, recommended: Mapping[str, Candidate], full: Map, full_bytes: int
 ) -> dict:
-    """All candidates as plain values; what has no value is None."""
+    """All candidates as JSON values; a missing value is None."""
     counted = {"images": len(full.images), "points": len(full.point3D_ids), "bytes": full_bytes}
     return {
         "full": counted | _prediction_to_json(frontier.full),
@@ -98,7 +142,7 @@ def frontier_to_json(
                 "points": len(one.choice.points),
                 "bytes": one.bytes,
                 "loss": one.loss,
-                "dominated": frontier.is_dominated(one),
+                "dominated": frontier.is_pareto_dominated(one),
                 "recommended": any(best is one for best in recommended.values()),
                 **_prediction_to_json(one.prediction),
             }

@@ -5,18 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.choices import frontier_to_json, print_frontier, promise
-from slimsfm.cli.execution import Execution, resumable
+from slimsfm.cli.choices import frontier_to_json, kept_graph, print_frontier, promise, read_reducible
+from slimsfm.cli.execution import Execution
 from slimsfm.cli.output import Flat, MapPath, Stopwatch, check_output, console, finish, parse
-from slimsfm.errors import InputError
 from slimsfm.files import replacing
-from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import load_or_compute_graph
-from slimsfm.graph.source import Edges
-from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map
-from slimsfm.mapping.map import check_has_features
+from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
-from slimsfm.reduction import USES, FrontierOptions, frontier, recommend
+from slimsfm.reduction import FrontierOptions, frontier, recommend
 from slimsfm.report.curves import curves_figure
 from slimsfm.report.figures import check_figure, save_figure
 
@@ -24,23 +19,21 @@ from slimsfm.report.figures import check_figure, save_figure
 def frontier_of(
     map: MapPath,
     /,
-    comparison: Annotated[FrontierOptions, Flat] = FrontierOptions(uses=USES),
-    edges: Edges = "auto",
+    comparison: Annotated[FrontierOptions, Flat] = FrontierOptions(),
     json: Path | None = None,
     curves: Path | None = None,
     execution: Annotated[Execution, Flat] = Execution(),
     overwrite: bool = False,
 ) -> None:
-    """Tell what a map can be reduced to and what each way is predicted to lose; recommend one a use.
+    """List what a map can be reduced to and what each way is predicted to lose; recommend one per use.
 
     Args:
-        map: A map.
-        comparison: What is compared.
-        edges: How the reference graph is computed, by which images are chosen.
+        map: The full map.
+        comparison: The ways to compare.
         json: Write all figures here.
-        curves: Draw loss and time over size here, as .svg, .png or .pdf.
+        curves: Draw loss and time against size here, as .svg, .png or .pdf.
         execution: Where the reference graph is computed.
-        overwrite: Replace what is there.
+        overwrite: Replace existing files.
     """
     watch = Stopwatch()
     for path in (json, curves):
@@ -48,17 +41,8 @@ def frontier_of(
             check_output(path, map, overwrite=overwrite)
     if curves:
         check_figure(curves)
-    full, size = read_map(map), bytes_by_part(map)["total"]
-    check_has_features(full)
-    if len(full.images) < 2:
-        raise InputError(f"{map}: has one image; there is nothing to reduce")
-    graph = None
-    if "images" in comparison.uses:
-        with resumable():
-            graph = load_or_compute_graph(
-                full, map, GraphOptions(edges=edges), execution.open_executor(), shown
-            ).graph
-    found = frontier(full, graph, weigh_map, comparison, shown)
+    full, size = read_reducible(map), bytes_by_part(map)["total"]
+    found = frontier(full, comparison, graph=kept_graph(map, execution), progress=shown)
     tried = {one.choice.use for one in found.candidates}
     recommended = {use: recommend(found, use) for use in comparison.uses if use in tried}
     print_frontier(found, recommended, size)

@@ -13,9 +13,9 @@ from slimsfm.cli.networks import Networks
 from slimsfm.cli.output import Flat, MapPath, Stopwatch, console, finish, parse
 from slimsfm.files import check_writable, replacing
 from slimsfm.graph import GraphOptions, GraphRun
-from slimsfm.graph.io import load_or_compute_graph, write_graph
-from slimsfm.graph.recall import estimate_recall
-from slimsfm.graph.source import resolve
+from slimsfm.graph.compute import estimate_recall, load_or_compute_graph
+from slimsfm.graph.io import write_graph
+from slimsfm.graph.options import resolve_edges
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import shown
 
@@ -32,17 +32,17 @@ def graph(
 ) -> None:
     """Find out which reference images localize which others.
 
-    The graph is kept in the map, and `reduce` uses it. After an interruption the same command goes on where
+    The graph is kept in the map, and `reduce` uses it. After an interruption the same command resumes where
     it stopped.
 
     Args:
-        map: A map.
+        map: The map; the graph is kept in its folder.
         edges: How edges are found.
         execution: Where the work is done.
         networks: Where learned methods run.
-        output: Write the graph here as well, as npz.
-        json: Write the figures here.
-        overwrite: Replace what is there.
+        output: Also write the graph here, as npz.
+        json: Write the statistics here.
+        overwrite: Replace existing files.
     """
     watch = Stopwatch()
     networks.apply()
@@ -55,7 +55,7 @@ def graph(
     figures = _figures(run, edges.threshold)
     for name, value in figures.items():
         console.print(f"{name:<20} {value}")
-    if resolve(map_, edges) == "localize" and edges.candidates == "likely":
+    if resolve_edges(map_, edges) == "localize" and edges.candidates == "likely":
         share = estimate_recall(map_, run, edges)
         console.print(f"{'recall':<20} {100 * share:.2f} % of the edges are on the pairs tried (estimated)")
     if output:
@@ -63,7 +63,7 @@ def graph(
     if json:
         with replacing(json, overwrite=overwrite) as partial:
             partial.write_text(json_format.dumps(figures, indent=2) + "\n")
-    finish(f"reference graph by {resolve(map_, edges)}", watch, "reduce", map, "-o", f"{map}-small")
+    finish(f"reference graph by {resolve_edges(map_, edges)}", watch, "reduce", map, "-o", f"{map}-small")
 
 
 def _figures(run: GraphRun, threshold: float) -> dict:

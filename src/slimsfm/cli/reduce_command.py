@@ -1,129 +1,90 @@
 """`slimsfm reduce`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated
 
 import tyro
 
-from slimsfm.cli.choices import print_change, promise
+from slimsfm.cli.choices import kept_graph, print_change, print_dominating_set, promise, read_reducible
 from slimsfm.cli.execution import Execution
-from slimsfm.cli.image_choice import ByImages
-from slimsfm.cli.limits import Limits
 from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
-from slimsfm.errors import InputError
-from slimsfm.mapping.io import read_map, weigh_map, write_map
-from slimsfm.mapping.map import Map, check_has_features
-from slimsfm.mapping.subset import with_points
+from slimsfm.cli.units import LimitArguments
+from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
-from slimsfm.reduction import Candidate, FrontierOptions, Maker, frontier, recommend, try_images
-from slimsfm.selection import SELECTORS
-
-Use = Literal["direct", "images", "both"]
+from slimsfm.reduction import ImageOptions, ReduceOptions
+from slimsfm.reduction import reduce as reduce_map
+from slimsfm.reduction.reduced import Use
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choosing:
-    """How what is kept is chosen."""
+class ReduceArguments:
+    """How to choose what is kept."""
 
-    for_: Annotated[Use, tyro.conf.arg(name="for")] = "direct"
-    """Match queries with points (direct), with images (images), or either way (both); limits then hold for
-    each of the two parts."""
+    for_: Annotated[Use | None, tyro.conf.arg(name="for")] = None
+    """Match queries with points (direct), with images (images), or with either (both). By default images if
+    an option below chooses images, else direct. With both, limits hold for each part."""
 
     selector: str | None = None
-    """Let this one choose the points: information, kcover, probabilistic or random."""
+    """Selector of the points: information, kcover or random. By default the first two are compared."""
 
-    limits: Annotated[Limits, Flat] = Limits()
-    """What the slim map must keep to."""
+    limits: Annotated[LimitArguments, Flat] = LimitArguments()
+    """Limits of the reduced map."""
 
-    by: Annotated[ByImages, Flat] = ByImages()
+    image_choice: Annotated[ImageOptions, Flat] = ImageOptions()
     """How images are chosen."""
 
     seed: int = 0
-    """Seed of every random choice."""
+    """Seed of all random choices."""
 
     def __post_init__(self) -> None:
-        if self.selector is not None and self.selector not in SELECTORS:
-            raise ValueError(f"selector must be one of {', '.join(SELECTORS)}, got {self.selector!r}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
-        if self.selector is not None and "direct" not in self.uses:
-            raise ValueError("selector chooses points, but only images are to be kept; see --for")
-        if self.by.is_given and "direct" not in self.uses and self.limits != Limits():
-            raise ValueError("images and random leave nothing to choose: limits do not go with them")
+        _ = self.options  # raises on invalid values and contradictions
 
     @property
-    def uses(self) -> tuple[str, ...]:
-        """What the slim map is for; images alone where only images are spoken of."""
-        if self.for_ == "both":
-            return ("direct", "images")
-        return ("images",) if self.by.is_wanted else (self.for_,)
+    def options(self) -> ReduceOptions:
+        """The options of the library."""
+        return ReduceOptions(
+            for_=self.for_,
+            selector=self.selector,
+            limits=self.limits.limits,
+            image_choice=self.image_choice,
+            seed=self.seed,
+        )
 
 
 def reduce(
     map: MapPath,
     /,
     output: OutputPath,
-    choosing: Annotated[Choosing, Flat] = Choosing(),
+    choosing: Annotated[ReduceArguments, Flat] = ReduceArguments(),
     execution: Annotated[Execution, Flat] = Execution(),
     overwrite: bool = False,
 ) -> None:
     """Make a map small, and say what that costs.
 
     Many ways are tried on the map's own images, each left out in turn, and the smallest that loses nothing is
-    taken; `slimsfm frontier` lists them all. Of a map built without a detector a dominating set is kept.
+    taken; `slimsfm frontier` lists them all. A dominating set of images is kept of a map that was built
+    without a detector.
 
     Args:
-        map: A map.
-        output: Where the slim map is written.
-        choosing: How what is kept is chosen.
+        map: The full map.
+        output: Where to write the reduced map.
+        choosing: How to choose what is kept.
         execution: Where the reference graph is computed.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing output.
     """
     watch = Stopwatch()
     check_output(output, map, overwrite=overwrite)
-    full = read_map(map)
-    check_has_features(full)
-    if len(full.images) < 2:
-        raise InputError(f"{map}: has one image; there is nothing to reduce")
-    if not full.has_keypoints and not choosing.by.is_wanted:  # there are no points to match
-        choosing = replace(choosing, by=replace(choosing.by, solver="exact"))
-    chosen = _chosen(full, map, choosing, execution)
-    slim = _slim(full, chosen)
-    write_map(slim, output, overwrite=overwrite)
-    print_change(map, full, output, slim)
-    for one in chosen.values():
+    full, options = read_reducible(map), choosing.options
+    reduced = reduce_map(full, options, graph=kept_graph(map, execution), progress=shown)
+    write_map(reduced.map, output, overwrite=overwrite)
+    for note in reduced.notes:
+        console.print(f"note: {note}")
+    print_dominating_set(reduced, options)
+    print_change(map, full, output, reduced.map)
+    for one in reduced.forecast.values():
         console.print(f"{one.choice.method} ({one.choice.detail}): {promise(map, full, one)}")
     finish(f"{output}: written", watch, "localize", output, "IMAGES", "-o", "poses.json")
-
-
-def _chosen(full: Map, path: Path, choosing: Choosing, execution: Execution) -> dict[str, Candidate]:
-    """What is chosen for each use."""
-    by, wish = choosing.by, choosing.limits.wish
-    chosen: dict[str, Candidate] = {}
-    if by.is_wanted:
-        names = by.choose(full, path, wish, choosing.seed, execution)
-        chosen["images"] = try_images(full, names, weigh_map, shown)
-    compared = tuple(use for use in choosing.uses if use not in chosen)
-    if compared:
-        options = FrontierOptions(uses=compared, seed=choosing.seed)
-        if choosing.selector:
-            options = replace(options, selectors=(choosing.selector,))
-        if wish.max_points:
-            options = replace(options, budgets=(*options.budgets, wish.max_points))
-        graph = by.load_or_compute_graph(full, path, execution) if "images" in compared else None
-        found = frontier(full, graph, weigh_map, options, shown)
-        chosen |= {use: recommend(found, use, wish) for use in compared}
-    return chosen
-
-
-def _slim(full: Map, chosen: dict[str, Candidate]) -> Map:
-    maker = Maker(full)
-    if len(chosen) == 1:
-        return maker.make(*(one.choice for one in chosen.values()))
-    points = maker.described(chosen["direct"].choice.points)
-    return with_points(maker.make(chosen["images"].choice), full, points)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -1,11 +1,9 @@
-"""Minimum dominating sets of directed graphs: pure graph theory, which knows of no images."""
+"""Minimum dominating sets of directed graphs: pure graph theory, independent of images."""
 
-from slimsfm.domination.cpsat import cpsat
-from slimsfm.domination.exact import exact
-from slimsfm.domination.greedy import greedy
-from slimsfm.domination.order import cover_order
+from slimsfm.domination.exact_solvers import cpsat, exact
+from slimsfm.domination.greedy_cover import cover_order, greedy
 from slimsfm.domination.problem import DominationProblem, dominates
-from slimsfm.domination.random_greedy import random_greedy
+from slimsfm.domination.random_draws import random_greedy
 from slimsfm.domination.solution import Solution, Solver
 from slimsfm.domination.validation import Adjacency
 

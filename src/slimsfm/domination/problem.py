@@ -12,27 +12,26 @@ from slimsfm.domination import validation
 from slimsfm.domination.validation import Adjacency
 
 TOLERANCE = 1e-9
-"""Relative difference of two sums of costs or errors that counts as none."""
+"""Sums of costs or errors are equal if they differ by less than this share."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class DominationProblem:
-    """A directed graph, of which the cheapest nodes that dominate all others are sought.
+    """Find the cheapest nodes of a directed graph that dominate all other nodes.
 
-    A set D of nodes meets what node v asks for if v is in D, or if at least k nodes of D have an edge to v,
-    k being `dominators`: k-domination [1], for k = 1 that of [2]. Where fewer than k nodes with an edge to v
-    may be chosen, all of them are enough, but not none: a node without any is to be in D itself or, if it is
-    forced out, asks for nothing. A group asks for one of its nodes in D.
+    A set D of nodes meets the requirement of node v if v is in D, or if at least k nodes of D have an edge to
+    v, where k is `dominators`: k-domination [1], which for k = 1 is that of [2]. If fewer than k nodes have
+    an edge to v, all of them are enough; if none has, v itself must be in D. The requirement of a group is
+    met if one of its nodes is in D.
 
-    Without a budget all that is asked for must be met, at the least cost. With one, the sum of the costs
-    stays within it, and D is to meet as much as can be met, a group counting like a node; of sets that meet
-    equally much, a cheapest one is sought. With `errors`, of the cheapest sets one of least total error.
+    Without a budget, all requirements must be met at the least cost. With a budget, the sum of the costs
+    stays within it, and D meets as many requirements as possible, of nodes and groups alike; among sets that
+    meet equally many, a cheapest one is best. With `errors`, a set of least total error is best among these.
 
     Raises:
         ValueError: `adjacency` is not square, not numeric or not finite; `costs` are not one positive finite
-            number a node; `dominators` is below 1; `budget` is below the cost of the nodes forced in; a node
-            is forced that is not in the graph, or is forced both in and out; a group has no node that is
-            not forced out; or an edge has no error, or one that is negative or not finite.
+            number per node; `dominators` is below 1; `budget` is negative; a group has no node; or an edge
+            has no error, or one that is negative or not finite.
 
     References:
         [1] Fink and Jacobson, n-domination in graphs, Graph Theory with Applications to Algorithms and
@@ -41,29 +40,23 @@ class DominationProblem:
     """
 
     adjacency: csr_array
-    """Boolean matrix in canonical CSR form: entry [u, v] is true when u dominates v. Whatever was given, its
-    diagonal is true, since every node dominates itself."""
+    """Boolean matrix in canonical CSR form: entry [u, v] is true when u dominates v. The diagonal is always
+    true, because every node dominates itself."""
 
     costs: np.ndarray
-    """What each node costs; all cost 1 where none are given."""
+    """Cost of each node; 1 by default."""
 
     dominators: int
-    """How many chosen nodes dominate each node that is not chosen itself, where so many could."""
+    """Number of chosen nodes that dominate each node that is not chosen, where enough nodes can."""
 
     budget: int | float | None
-    """The largest sum of costs, or None."""
-
-    forced_in: tuple[int, ...]
-    """Nodes that are chosen in any case, ascending."""
-
-    forced_out: tuple[int, ...]
-    """Nodes that may not be chosen, ascending; they are still to be dominated."""
+    """Largest sum of costs, or None."""
 
     groups: csr_array
-    """Boolean matrix; at least one node of each row is to be chosen."""
+    """Boolean matrix; at least one node of each row must be chosen."""
 
     errors: csr_array | None
-    """Error of v as dominated by u on the entries of `adjacency`, 0 on the diagonal; or None."""
+    """Error of v when u dominates it, on the entries of `adjacency`, 0 on the diagonal; or None."""
 
     def __init__(
         self,
@@ -72,8 +65,6 @@ class DominationProblem:
         costs: np.ndarray | None = None,
         dominators: int = 1,
         budget: int | float | None = None,
-        forced_in: Iterable[int] = (),
-        forced_out: Iterable[int] = (),
         groups: Adjacency | None = None,
         errors: Adjacency | None = None,
     ) -> None:
@@ -86,17 +77,13 @@ class DominationProblem:
             "costs": validation.canonical_costs(costs, n),
             "dominators": dominators,
             "budget": budget,
-            "forced_in": validation.canonical_nodes("forced_in", forced_in, n),
-            "forced_out": validation.canonical_nodes("forced_out", forced_out, n),
             "groups": validation.canonical_groups(groups, n),
             "errors": None if errors is None else validation.canonical_errors(errors, closed),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        validation.check_forced(self.forced_in, self.forced_out, self.groups)
-        if budget is not None and not budget >= self.cost(self.forced_in):
-            forced = self.cost(self.forced_in)
-            raise ValueError(f"budget must be at least {forced}, the cost of forced_in, got {budget}")
+        if budget is not None and not budget >= 0:
+            raise ValueError(f"budget must not be negative, got {budget}")
 
     @property
     def num_nodes(self) -> int:
@@ -105,37 +92,34 @@ class DominationProblem:
 
     @property
     def whole_costs(self) -> bool:
-        """Whether all costs are whole numbers, as where none were given."""
+        """Whether all costs are integers, as they are by default."""
         return bool(np.all(self.costs == np.floor(self.costs)))
 
     @cached_property
     def requirements(self) -> tuple[csr_array, Ids]:
-        """What is asked for, as a covering problem: matrix A of whole numbers and vector b.
+        """The requirements as a covering problem: an integer matrix A and a vector b.
 
-        The set with indicator x meets requirement i if (A x)_i >= b_i. The first requirements are the nodes',
-        the last the groups'. Columns of nodes forced out are empty; b_i is 0 where nothing can be asked for.
+        The set with indicator x meets requirement i if (A x)_i >= b_i. The requirements of the nodes come
+        first, those of the groups last.
         """
-        out = np.zeros(self.num_nodes, dtype=bool)
-        out[list(self.forced_out)] = True
-        allowed = diags_array((~out).astype(np.int64), format="csr", dtype=np.int64)
         identity = diags_array(np.ones(self.num_nodes), format="csr", dtype=np.int64)
-        others = csr_array((self.adjacency.astype(np.int64) - identity).T) @ allowed
+        others = csr_array((self.adjacency.astype(np.int64) - identity).T)
         available = np.asarray(others.sum(axis=1), dtype=np.int64).ravel()
-        needs = np.maximum(np.minimum(self.dominators, available), np.where(out, 0, 1))
-        own = diags_array(np.where(out, 0, needs), format="csr", dtype=np.int64)
-        grouped = csr_array(self.groups.astype(np.int64) @ allowed)
+        needs = np.maximum(np.minimum(self.dominators, available), 1)
+        own = diags_array(needs, format="csr", dtype=np.int64)
+        grouped = csr_array(self.groups.astype(np.int64))
         matrix = csr_array(vstack([others + own, grouped], format="csr"))
         matrix.eliminate_zeros()
         matrix.sort_indices()
         return matrix, np.concatenate([needs, np.ones(len(grouped.indptr) - 1, dtype=np.int64)])
 
     def cost(self, chosen: Iterable[int]) -> int | float:
-        """Sum of the costs of nodes; a whole number, as an int, where all costs are whole."""
+        """Sum of the costs of nodes; an int if all costs are integers."""
         total = float(self.costs[self._nodes(chosen)].sum())
         return int(total) if self.whole_costs else total
 
     def num_unmet(self, chosen: Iterable[int]) -> int:
-        """How many nodes and groups lack what they ask for under a chosen set without nodes forced out.
+        """Number of requirements of nodes and groups that a set does not meet.
 
         Raises:
             ValueError: `chosen` has a node that is not in the graph.
@@ -143,9 +127,9 @@ class DominationProblem:
         return int((~self._met(self._nodes(chosen))).sum())
 
     def total_error(self, chosen: Iterable[int]) -> float:
-        """Sum of the errors of the nodes that are not chosen and have what they ask for.
+        """Sum of the errors of the nodes that are not chosen and whose requirements are met.
 
-        Each counts with the least error from a chosen node. The sum is 0 where the problem has no errors.
+        Each node counts with its least error from a chosen node. The sum is 0 if the problem has no errors.
 
         Raises:
             ValueError: `chosen` has a node that is not in the graph.
@@ -160,19 +144,14 @@ class DominationProblem:
         return float(best[counted].sum())
 
     def satisfies(self, chosen: Iterable[int]) -> bool:
-        """Check whether a chosen set keeps to all parts of the problem.
+        """Check whether a set is feasible: without a budget it meets all requirements, else it is within it.
 
-        It has the nodes forced in and none forced out and, without a budget, meets all that is asked for;
-        with one, its cost is within the budget. How good it is beyond that, `num_unmet`, `cost` and
-        `total_error` say, in this order.
+        Feasible sets are compared by `num_unmet`, `cost` and `total_error`, in this order.
 
         Raises:
             ValueError: `chosen` has a node that is not in the graph.
         """
         chosen = validation.canonical_nodes("chosen", chosen, self.num_nodes)
-        members = set(chosen)
-        if not members.issuperset(self.forced_in) or not members.isdisjoint(self.forced_out):
-            return False
         if self.budget is None:
             return self.num_unmet(chosen) == 0
         return self.cost(chosen) <= self.budget * (1 + TOLERANCE)
@@ -194,13 +173,13 @@ def dominates(adjacency: Adjacency, chosen: Iterable[int]) -> bool:
 
     Args:
         adjacency: Square matrix, entry [u, v] true when u dominates v. Its diagonal counts as true.
-        chosen: The nodes of D, in any order; the empty set dominates the empty graph alone.
+        chosen: The nodes of D, in any order. The empty set dominates only the empty graph.
 
     Returns:
-        True if no node is left undominated.
+        True if every node is dominated.
 
     Raises:
-        ValueError: `adjacency` is no problem's, or `chosen` has a node that is not in the graph.
+        ValueError: `adjacency` is not valid for a problem, or `chosen` has a node that is not in the graph.
 
     Notes:
         Time is linear in the number of edges.

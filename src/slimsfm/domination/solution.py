@@ -1,4 +1,4 @@
-"""What solvers return: a set, and how far it can be from the best."""
+"""The result of a solver: a set, and proven bounds on the best set."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -8,36 +8,36 @@ from typing import Protocol
 
 from slimsfm.domination.problem import TOLERANCE, DominationProblem
 
-_BOUND_TOLERANCE = 1e-6  # of the solvers' own arithmetic
+_BOUND_TOLERANCE = 1e-6  # rounding errors of the solvers
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """A dominating set and how far it can be from the best: fewest unmet, then cheapest, then least error."""
+    """A dominating set and bounds on the best one: fewest unmet, then cheapest, then least error."""
 
     chosen: tuple[int, ...]
     """The set's nodes, ascending."""
 
     cost: int | float
-    """Sum of the nodes' costs: their number where the problem has no costs."""
+    """Sum of the nodes' costs; by default their number."""
 
     lower_bound: int | float
-    """No set costs less that leaves no more unmet than the best one does; this is proven."""
+    """Proven: no set that leaves as few requirements unmet as the best one costs less."""
 
     unmet: int = 0
-    """How many nodes and groups lack what they ask for; 0 without a budget."""
+    """Number of requirements that are not met; 0 without a budget."""
 
     unmet_bound: int = 0
-    """No set within the budget leaves fewer unmet; this is proven."""
+    """Proven: no set within the budget leaves fewer requirements unmet."""
 
     error: float = 0.0
-    """Total error of the nodes that are not chosen; 0 where the problem has no errors."""
+    """Total error of the nodes that are not chosen; 0 if the problem has no errors."""
 
     error_bound: float = 0.0
-    """No set that is best in cost has a smaller total error; this is proven."""
+    """Proven: no set of the least cost has a smaller total error."""
 
     seconds: float = field(default=0.0, compare=False)
-    """How long the search took; takes no part in comparing solutions."""
+    """Duration of the search; ignored when solutions are compared."""
 
     def __post_init__(self) -> None:
         if any(u >= v for u, v in pairwise(self.chosen)):
@@ -49,7 +49,7 @@ class Solution:
 
     @property
     def gap(self) -> int | float:
-        """How much less the best set may cost, at most."""
+        """Upper bound of the cost that a better set could save."""
         return self.cost - self.lower_bound
 
     @property
@@ -65,30 +65,30 @@ class Solution:
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """What is proven of the best set of a problem."""
+    """Proven bounds on the best set of a problem."""
 
     unmet: int | float = 0
-    """It leaves no fewer unmet."""
+    """Least number of unmet requirements."""
 
     cost: int | float = 0
-    """It costs no less."""
+    """Least cost."""
 
     error: float = 0.0
-    """Its total error is no smaller."""
+    """Least total error."""
 
 
 class Solver(Protocol):
-    """A method for the minimum dominating set: all take these arguments, their own ones have defaults."""
+    """A solver of the minimum dominating set problem; further arguments have defaults."""
 
     def __call__(self, problem: DominationProblem, *, seed: int = 0) -> Solution:
-        """Find a dominating set; `seed` settles what is left to chance."""
+        """Find a dominating set; equal problems and seeds give equal solutions."""
         ...
 
 
 def merit(problem: DominationProblem, chosen: tuple[int, ...]) -> tuple[int, float, float]:
-    """What solutions are compared by, the smaller the better: number unmet, cost, error.
+    """The key by which solutions are compared, smaller is better: number unmet, cost, error.
 
-    Cost and error are rounded, so that sums that differ only by the order of summation are equal.
+    Cost and error are rounded, so that sums that differ only in the order of summation are equal.
     """
     cost, error = problem.cost(chosen), problem.total_error(chosen)
     return problem.num_unmet(chosen), _rounded(cost), _rounded(error)
@@ -97,7 +97,7 @@ def merit(problem: DominationProblem, chosen: tuple[int, ...]) -> tuple[int, flo
 def solution_of(
     problem: DominationProblem, chosen: tuple[int, ...], bounds: Bounds, start: float
 ) -> Solution:
-    """Report a set with what is proven of the best one, found since `start` (of `perf_counter`).
+    """Create the solution of a search that started at `start`, by `perf_counter`.
 
     A bound on the cost counts only once it is proven that no set leaves fewer unmet, one on the error once
     the cost is proven least. Where costs are whole numbers, so is the bound on them.
@@ -119,12 +119,12 @@ def solution_of(
 
 
 def rounded_up(bound: int | float) -> int | float:
-    """The least whole number that is not below a bound, but for the arithmetic; minus infinity stays."""
+    """The least integer that is not below a bound, up to rounding errors; minus infinity is unchanged."""
     return ceil(bound - _BOUND_TOLERANCE) if isfinite(bound) else bound
 
 
 def _met_bound(value: int | float, bound: int | float, *, whole: bool = False) -> int | float:
-    """The bound, rounded up if whole, and equal to the value where it is so within the arithmetic."""
+    """The bound, rounded up if whole, and equal to the value if they agree up to rounding errors."""
     if whole:
         return min(value, int(max(0, rounded_up(bound))))
     return value if bound >= value - _BOUND_TOLERANCE * max(1.0, value) else max(0.0, bound)

@@ -1,4 +1,4 @@
-"""The parts of a problem, checked and brought into one form each."""
+"""Checks of the parts of a problem, and their canonical forms."""
 
 from collections.abc import Iterable
 
@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import csr_array, eye_array, sparray
 
 Adjacency = csr_array | np.ndarray
-"""Square matrix, row u the nodes that u dominates; what is not zero counts as true."""
+"""Square matrix; row u marks the nodes that u dominates. Values other than zero count as true."""
 
 
 def canonical_adjacency(adjacency: Adjacency) -> csr_array:
@@ -22,12 +22,12 @@ def canonical_adjacency(adjacency: Adjacency) -> csr_array:
 
 
 def canonical_costs(costs: np.ndarray | None, num_nodes: int) -> np.ndarray:
-    """One positive number a node, 1 if none are given."""
+    """One positive number per node; 1 by default."""
     if costs is None:
         return np.ones(num_nodes)
     values = np.array(costs, dtype=np.float64)
     if values.shape != (num_nodes,):
-        raise ValueError(f"costs must be one a node, of shape ({num_nodes},), got shape {values.shape}")
+        raise ValueError(f"costs must be one per node, of shape ({num_nodes},), got shape {values.shape}")
     wrong = ~(np.isfinite(values) & (values > 0))
     if wrong.any():
         raise ValueError(f"costs must be positive and finite, got {values[wrong][0]}")
@@ -35,7 +35,7 @@ def canonical_costs(costs: np.ndarray | None, num_nodes: int) -> np.ndarray:
 
 
 def canonical_nodes(name: str, nodes: Iterable[int], num_nodes: int) -> tuple[int, ...]:
-    """Nodes of the graph, ascending, each once."""
+    """The nodes in ascending order, without duplicates."""
     ids = np.array(list(nodes), dtype=np.int64)
     if np.any((ids < 0) | (ids >= num_nodes)):
         raise ValueError(f"{name} must be nodes in [0, {num_nodes}), got {ids.tolist()}")
@@ -43,7 +43,7 @@ def canonical_nodes(name: str, nodes: Iterable[int], num_nodes: int) -> tuple[in
 
 
 def canonical_groups(groups: Adjacency | None, num_nodes: int) -> csr_array:
-    """A boolean matrix in canonical CSR form, one column a node; without rows if there are no groups."""
+    """A boolean matrix in canonical CSR form, one column per node; without rows if there are no groups."""
     if groups is None:
         return csr_array((0, num_nodes), dtype=bool)
     shape = tuple(groups.shape or ())
@@ -52,22 +52,14 @@ def canonical_groups(groups: Adjacency | None, num_nodes: int) -> csr_array:
     rows = csr_array(_numbers("groups", groups).astype(bool))
     rows.sum_duplicates()
     rows.eliminate_zeros()
+    empty = np.flatnonzero(np.diff(rows.indptr) == 0)
+    if len(empty):
+        raise ValueError(f"groups must each have a node, got none in {empty.tolist()}")
     return rows
 
 
-def check_forced(forced_in: tuple[int, ...], forced_out: tuple[int, ...], groups: csr_array) -> None:
-    """Refuse nodes forced both ways and groups of which no node may be chosen."""
-    both = sorted(set(forced_in) & set(forced_out))
-    if both:
-        raise ValueError(f"forced_in and forced_out must have no node in common, got {both} in both")
-    rows = np.split(groups.indices, groups.indptr[1:-1])[: len(groups.indptr) - 1]
-    empty = [number for number, row in enumerate(rows) if np.isin(row, forced_out).all()]
-    if empty:
-        raise ValueError(f"groups must each have a node that is not forced out, got none in {empty}")
-
-
 def canonical_errors(errors: Adjacency, adjacency: csr_array) -> csr_array:
-    """The errors on the entries of the adjacency, and on no others; 0 on the diagonal."""
+    """The errors on exactly the entries of the adjacency; 0 on the diagonal."""
     if tuple(errors.shape or ()) != adjacency.shape:
         raise ValueError(f"errors must be of shape {adjacency.shape}, got {tuple(errors.shape or ())}")
     rows = np.repeat(np.arange(len(adjacency.indptr) - 1), np.diff(adjacency.indptr))
@@ -83,7 +75,7 @@ def canonical_errors(errors: Adjacency, adjacency: csr_array) -> csr_array:
 
 
 def _looked_up(errors: Adjacency, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The values at entries; NaN where a sparse matrix stores none."""
+    """The values at entries; NaN where a sparse matrix stores no value."""
     if not isinstance(errors, sparray):
         return np.asarray(errors, dtype=np.float64)[rows, columns]
     stored = csr_array(errors, dtype=np.float64, copy=True)

@@ -11,16 +11,16 @@ from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, Object
 from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
 from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.io import load_or_compute_graph
-from slimsfm.graph.source import Edges
+from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.options import Edges
 from slimsfm.localization import LocalizationOptions
 from slimsfm.localization.localizer import supports
 from slimsfm.mapping.build import BuildOptions
-from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map, write_map
+from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction import ReductionOptions, dominating_set
+from slimsfm.reduction import DominatingSetOptions, dominating_set
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class BenchmarkOptions:
     edges: Edges = "localize"
     """How to compute the reference graph; the paper localizes each image from each other image."""
 
-    reduction: ReductionOptions = ReductionOptions()
+    reduction: DominatingSetOptions = DominatingSetOptions()
     """How to choose dominating sets."""
 
     def __post_init__(self) -> None:
@@ -173,7 +173,6 @@ def _variant_inputs(task: _MethodTask) -> VariantInputs:
         graph=graph,
         reduction=options.reduction,
         solution=dominating_set(graph, options.reduction, full),
-        weigh=weigh_map,
         progress=progress,
     )
 

@@ -16,16 +16,15 @@ from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction import (
     Choice,
+    DominatingSetOptions,
     FrontierOptions,
-    Maker,
-    ReductionOptions,
-    Weigh,
+    apply_choice,
     dominating_set,
     frontier,
     keep_random_images,
     recommend,
 )
-from slimsfm.selection import SELECTORS
+from slimsfm.selection import SELECTORS, current_selector
 from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.usable_points import selection_problem
 
@@ -43,14 +42,11 @@ class VariantInputs:
     graph: ReferenceGraph
     """Its reference graph."""
 
-    reduction: ReductionOptions
+    reduction: DominatingSetOptions
     """How to choose dominating sets; the settings of a variant override it."""
 
     solution: Solution
     """The dominating set for these options."""
-
-    weigh: Weigh
-    """Returns the size of a map."""
 
     progress: ProgressBar = silent
     """Progress callback."""
@@ -119,7 +115,7 @@ def _full(inputs: VariantInputs, _: None) -> list[Map]:
 
 
 def _reduction_settings(words: list[str]) -> dict[str, Any]:
-    """The fields of `ReductionOptions` to override."""
+    """The fields of `DominatingSetOptions` to override."""
     settings = {}
     for word in words:
         key, _, value = word.partition("=")
@@ -127,7 +123,7 @@ def _reduction_settings(words: list[str]) -> dict[str, Any]:
         if field in settings:
             raise ValueError(f"{key} is set twice")
         settings[field] = read(value)
-    ReductionOptions(**settings)  # raises for invalid values
+    DominatingSetOptions(**settings)  # refuses what cannot be
     return settings
 
 
@@ -174,16 +170,14 @@ def _default(inputs: VariantInputs, _: None) -> list[Map]:
     if not inputs.map.has_keypoints:
         return []
     options = FrontierOptions(uses=("direct",))
-    found = frontier(inputs.map, None, inputs.weigh, options, inputs.progress)
-    return [Maker(inputs.map).make(recommend(found, "direct").choice)]
+    found = frontier(inputs.map, options, progress=inputs.progress)
+    return [apply_choice(inputs.map, recommend(found, "direct").choice)]
 
 
 def _points_settings(words: list[str]) -> tuple[int, str]:
     count, *rest = words
     (selector,) = rest or [_SELECTOR]
-    if selector not in SELECTORS:
-        raise ValueError(f"selectors are {', '.join(SELECTORS)}")
-    return _count([count]) or 0, selector
+    return _count([count]) or 0, current_selector(selector)
 
 
 def _points(inputs: VariantInputs, settings: tuple[int, str]) -> list[Map]:
@@ -193,7 +187,7 @@ def _points(inputs: VariantInputs, settings: tuple[int, str]) -> list[Map]:
     problem = selection_problem(inputs.map, LeftOut(inputs.map), inputs.progress)
     points = np.sort(SELECTORS[selector](problem, count, seed=inputs.reduction.seed))
     choice = Choice(use="direct", method=selector, detail=f"{count} points", images=(), points=points)
-    return [Maker(inputs.map).make(choice)]
+    return [apply_choice(inputs.map, choice)]
 
 
 VARIANTS = {

@@ -1,8 +1,8 @@
 """The reference graph: which reference image localizes which other one."""
 
-from slimsfm.graph.compute import GraphRun, GraphWork, compute_graph
-from slimsfm.graph.reference_graph import ReferenceGraph
-from slimsfm.graph.source import EDGE_SOURCES, EdgeSource, GraphOptions, PairErrors
+from slimsfm.graph.compute import GraphWork, compute_graph, load_or_compute_graph
+from slimsfm.graph.options import EDGE_SOURCES, EdgeSource, GraphOptions, PairErrors
+from slimsfm.graph.reference_graph import GraphRun, ReferenceGraph
 
 __all__ = [
     "EDGE_SOURCES",
@@ -13,4 +13,5 @@ __all__ = [
     "PairErrors",
     "ReferenceGraph",
     "compute_graph",
+    "load_or_compute_graph",
 ]

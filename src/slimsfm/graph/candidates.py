@@ -1,4 +1,4 @@
-"""Pairs of reference images that may localize each other; the others need not be tried."""
+"""Pairs of reference images that may localize each other; all other pairs can be skipped."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -7,13 +7,13 @@ from scipy.sparse import triu
 from slimsfm.geometry import project
 from slimsfm.mapping.map import Map, observed
 
-_GRID = 5  # samples of the box along each edge
-_MAX_ANGLE_DEG = 75.0  # between viewing directions; no extractor here bears more
-_BLOCK = 1024  # images compared at a time
+_GRID = 5  # samples along each edge of the box
+_MAX_ANGLE_DEG = 75.0  # between viewing directions: no built-in extractor matches across more
+_BLOCK = 1024  # images compared at once
 
 
 def covisible_pairs(map: Map, min_points: int = 1) -> Int64[np.ndarray, "k 2"]:
-    """Pairs (u, v), u < v, that see at least so many common points; O(sum of squared track lengths)."""
+    """Pairs (u, v), u < v, that see at least `min_points` common points; O(sum of squared track lengths)."""
     incidence = observed(map).astype(np.int32)
     common = triu(incidence @ incidence.T, k=1).tocoo()
     enough = common.data >= min_points
@@ -21,10 +21,10 @@ def covisible_pairs(map: Map, min_points: int = 1) -> Int64[np.ndarray, "k 2"]:
 
 
 def likely_pairs(map: Map) -> Int64[np.ndarray, "k 2"]:
-    """Pairs that see a common point, or overlapping parts of the box from directions not too far apart.
+    """Pairs that see a common point, or overlapping parts of the box from directions within 75 degrees.
 
-    What an image sees of the box is sampled on a 5 x 5 x 5 grid; its direction runs from the camera to the
-    mean of the samples it sees.
+    The box is sampled on a 5 x 5 x 5 grid. The direction of an image points from its camera to the mean of
+    the samples it sees.
     """
     visible, directions = _views(map)
     least_cosine = np.cos(np.radians(_MAX_ANGLE_DEG))
@@ -38,12 +38,12 @@ def likely_pairs(map: Map) -> Int64[np.ndarray, "k 2"]:
 
 
 def all_pairs(map: Map) -> Int64[np.ndarray, "k 2"]:
-    """Every pair."""
+    """All pairs (u, v), u < v."""
     return np.stack(np.triu_indices(len(map.images), k=1), axis=1).astype(np.int64)
 
 
 def _views(map: Map) -> tuple[Float32[np.ndarray, "n s"], Float32[np.ndarray, "n 3"]]:
-    """Which samples of the box each image sees, as 0 and 1, and its direction towards them (0 if none)."""
+    """Which samples of the box each image sees, as 0 and 1, and its direction toward them (0 if none)."""
     steps = np.linspace(-1, 1, _GRID)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     samples = map.box.center + grid @ map.box.half_edges

@@ -1,59 +1,102 @@
-"""Reference graphs on disk, kept in the map that they are of, or given by another system."""
+"""Reference graphs and the progress of their computation on disk.
+
+A checkpoint is a file that stays readable when the process crashes at any moment:
+
+    KEY (64 characters) and a newline
+    u, v (two little-endian 32-bit integers), error of v from u, of u from v (two 64-bit floats); and so on
+
+Records are only ever appended. A file with another key belongs to other work and is replaced; half a record
+at the end is the result of a crash and is removed.
+"""
 
 import csv
-import os
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
+from types import TracebackType
 from zipfile import BadZipFile
 
 import numpy as np
+from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array
 
-from slimsfm.errors import InputError
-from slimsfm.execution import OpenExecutor
-from slimsfm.files import remove, replacing
-from slimsfm.graph.compute import GraphRun, GraphWork, compute_graph
-from slimsfm.graph.key import graph_key
-from slimsfm.graph.reference_graph import ReferenceGraph
-from slimsfm.graph.source import GraphOptions, resolve
+from slimsfm.errors import InputError, OutputError
+from slimsfm.files import replacing
+from slimsfm.graph.reference_graph import GraphRun, ReferenceGraph
 from slimsfm.mapping.map import Map
-from slimsfm.progress import ProgressBar, silent
 
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error)
 
+_RECORD = np.dtype([("u", "<u4"), ("v", "<u4"), ("v_from_u", "<f8"), ("u_from_v", "<f8")])
 
-def load_or_compute_graph(
-    map: Map,
-    folder: Path,
-    options: GraphOptions = GraphOptions(),
-    open_executor: OpenExecutor | None = None,
-    progress: ProgressBar = silent,
-) -> GraphRun:
-    """The reference graph of a map, kept in a folder, which with `open_executor` is the map's own.
 
-    Read from the folder if it is there and fits, else computed and written there; a computation that was cut
-    off goes on where it stopped. A folder that cannot be written to keeps nothing.
+class Checkpoint:
+    """Keeps the errors of pairs in a file. A context manager, which closes the file and leaves it there.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
-    start = perf_counter()
-    key = graph_key(map, options)
-    path = folder / f"graph-{resolve(map, options)}.npz"
-    run = _read_kept(path, key, start)
-    if run is None and not os.access(folder, os.W_OK):
-        return compute_graph(map, options, GraphWork(map_path=folder, open_executor=open_executor), progress)
-    if run is None:
-        checkpoint = path.with_suffix(".partial")
-        work = GraphWork(map_path=folder, open_executor=open_executor, checkpoint=checkpoint)
-        run = compute_graph(map, options, work, progress)
-        write_graph(path, run.graph, key=key, pairs_tried=run.pairs_tried)
-        remove(checkpoint)
-    return run
+
+    def __init__(self, path: Path, key: str) -> None:
+        self._path = path
+        self._header = key.encode("ascii") + b"\n"
+        self.pairs, self.errors = self._resume()
+
+    def _resume(self) -> tuple[Int64[np.ndarray, "k 2"], Float64[np.ndarray, "k 2"]]:
+        data = self._path.read_bytes() if self._path.exists() else b""
+        if not data.startswith(self._header):
+            data = self._begin()
+        count = (len(data) - len(self._header)) // _RECORD.itemsize
+        records = np.frombuffer(data, _RECORD, count, len(self._header))
+        self._file = self._path.open("r+b")
+        self._file.seek(len(self._header) + count * _RECORD.itemsize)
+        self._file.truncate()
+        pairs = np.stack([records["u"], records["v"]], axis=1).astype(np.int64)
+        return pairs, np.stack([records["v_from_u"], records["u_from_v"]], axis=1)
+
+    def _begin(self) -> bytes:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.write_bytes(self._header)
+        except OSError as error:
+            with suppress(OSError):
+                self._path.unlink()
+            raise self._failure(error) from error
+        return self._header
+
+    def _failure(self, error: OSError) -> OutputError:
+        return OutputError(f"{self._path}: cannot be written ({error.strerror or error})")
+
+    def __enter__(self) -> "Checkpoint":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):  # `append` has already raised it
+            self._file.close()
+
+    def append(self, pairs: Int64[np.ndarray, "k 2"], errors: Float64[np.ndarray, "k 2"]) -> None:
+        """Append the errors of some pairs.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        records = np.empty(len(pairs), _RECORD)
+        records["u"], records["v"] = pairs.T
+        records["v_from_u"], records["u_from_v"] = errors.T
+        try:
+            self._file.write(records.tobytes())
+            self._file.flush()
+        except OSError as error:
+            raise self._failure(error) from error
 
 
-def write_graph(path: Path, graph: ReferenceGraph, *, key: str = "", pairs_tried: int = 0) -> None:
-    """Write a graph as npz (names, the errors in CSR form, the key), replacing what stood there."""
+def write_graph(path: str | Path, graph: ReferenceGraph, *, key: str = "", pairs_tried: int = 0) -> None:
+    """Write a graph as npz (names, errors in CSR form, key), replacing an existing file."""
     errors = graph.errors
-    with replacing(path, overwrite=True) as partial, partial.open("wb") as file:
+    with replacing(Path(path), overwrite=True) as partial, partial.open("wb") as file:
         np.savez(
             file,
             names=np.array(graph.names),
@@ -65,8 +108,14 @@ def write_graph(path: Path, graph: ReferenceGraph, *, key: str = "", pairs_tried
         )
 
 
-def _read_kept(path: Path, key: str, start: float) -> GraphRun | None:
-    """A graph that was kept; None where there is none, or one of another map or other options."""
+def read_kept_graph(path: Path, key: str, start: float) -> GraphRun | None:
+    """Read a graph that was kept by `write_graph`; None if it is missing, damaged or has another key.
+
+    Args:
+        path: The npz file.
+        key: The expected `graph_key`.
+        start: When the caller started, by `perf_counter`: the time until now is reported as that of reading.
+    """
     try:
         with path.open("rb") as file, np.load(file) as stored:
             if str(stored["key"]) != key:
@@ -77,7 +126,7 @@ def _read_kept(path: Path, key: str, start: float) -> GraphRun | None:
                 seconds={"read": perf_counter() - start},
             )
     except _UNREADABLE:
-        return None  # computed again and replaced
+        return None
 
 
 def _from_npz(stored: np.lib.npyio.NpzFile) -> ReferenceGraph:
@@ -90,16 +139,19 @@ def _from_npz(stored: np.lib.npyio.NpzFile) -> ReferenceGraph:
     return ReferenceGraph.from_errors(names, pairs, entries.data.astype(np.float64))
 
 
-def read_given_graph(path: Path, map: Map) -> ReferenceGraph:
+def read_given_graph(path: str | Path, map: Map) -> ReferenceGraph:
     """Read errors that another system computed.
 
-    Either a CSV file with the header `reference,query,error`, a row a pair of image names with the relative
-    corner error of the query's pose estimated from the reference alone (a pair without a row has no pose),
-    or an npz file as `slimsfm graph -o` writes it.
+    Args:
+        path: Either a CSV file with the header `reference,query,error` and one row per pair of image names
+            with the relative corner error of the query's pose, estimated from the reference alone (a pair
+            without a row has no pose); or an npz file written by `write_graph`.
+        map: The map that the graph belongs to.
 
     Raises:
         InputError: The file is missing or damaged, or names images that the map does not have.
     """
+    path = Path(path)
     if path.suffix == ".csv":
         return _read_csv(path, map)
     try:
@@ -108,7 +160,7 @@ def read_given_graph(path: Path, map: Map) -> ReferenceGraph:
     except _UNREADABLE as error:
         raise InputError(f"{path}: not a readable graph, neither .csv nor .npz ({error})") from error
     if graph.names != tuple(map.images):
-        raise InputError(f"{path}: the graph is of other images than the map")
+        raise InputError(f"{path}: the images of the graph are not those of the map")
     return graph
 
 
@@ -119,7 +171,7 @@ def _read_csv(path: Path, map: Map) -> ReferenceGraph:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             if not {"reference", "query", "error"} <= set(rows.fieldnames or ()):
-                raise InputError(f"{path}: has not the columns reference, query, error")
+                raise InputError(f"{path}: lacks one of the columns reference, query, error")
             for row in rows:
                 pairs.append((index[row["reference"]], index[row["query"]]))
                 errors.append(float(row["error"]))
@@ -127,6 +179,6 @@ def _read_csv(path: Path, map: Map) -> ReferenceGraph:
             tuple(map.images), np.array(pairs, np.int64).reshape(-1, 2), np.array(errors, np.float64)
         )
     except KeyError as error:
-        raise InputError(f"{path}: {error} is no image of the map") from error
+        raise InputError(f"{path}: {error} is not an image of the map") from error
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: not a readable table of errors ({error})") from error

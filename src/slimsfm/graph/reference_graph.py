@@ -10,27 +10,27 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceGraph:
-    """How well each reference image localizes each other one.
+    """How well each reference image localizes each other reference image.
 
-    The errors are kept, not only the decisions, so a threshold can be chosen and changed afterwards.
+    The graph holds errors, not decisions, so that the threshold can be changed later.
     """
 
     names: tuple[str, ...]
     """The reference images, sorted."""
 
     errors: csr_array
-    """n x n; the entry [u, v] is the relative corner error of v's pose estimated from u alone. There is none
-    without a pose, nor on the diagonal."""
+    """n x n; the entry [u, v] is the relative corner error of v's pose estimated from u alone. Pairs
+    without a pose and the diagonal have no entry."""
 
     @classmethod
     def from_errors(
         cls, names: tuple[str, ...], pairs: Int64[np.ndarray, "k 2"], errors: Float64[np.ndarray, " k"]
     ) -> "ReferenceGraph":
-        """Make the graph whose error on the ordered pair in row i of `pairs` is entry i of `errors`.
+        """Create the graph with error `errors[i]` on the ordered pair `pairs[i]`.
 
         Raises:
-            ValueError: A pair is that of an image with itself, occurs twice or names no image, or an error is
-                negative or no number.
+            ValueError: A pair joins an image with itself, occurs twice or has an index out of range, or an
+                error is negative or NaN.
         """
         _check(len(names), pairs, errors)
         finite = np.isfinite(errors)
@@ -41,7 +41,7 @@ class ReferenceGraph:
         return cls(names=names, errors=stored)
 
     def dense(self) -> Float64[np.ndarray, "n n"]:
-        """The errors as a full matrix: 0 on the diagonal, infinite where there is no pose."""
+        """The errors as a dense matrix: 0 on the diagonal, infinite where there is no pose."""
         full = np.full((len(self.names), len(self.names)), np.inf)
         entries = self.errors.tocoo()
         full[entries.row, entries.col] = entries.data
@@ -49,7 +49,7 @@ class ReferenceGraph:
         return full
 
     def adjacency(self, threshold: float = 0.05) -> csr_array:
-        """[u, v] is true where u localizes v: the error is below the threshold. u never is v."""
+        """[u, v] is true where u localizes v: the error is below the threshold. The diagonal is false."""
         entries = self.errors.tocoo()
         good = entries.data < threshold
         values = np.ones(int(good.sum()), bool)
@@ -65,12 +65,26 @@ class ReferenceGraph:
         return np.stack([np.asarray(edges.sum(axis=axis)).ravel() for axis in (1, 0)]).astype(np.int64)
 
     def isolated(self, threshold: float = 0.05) -> Bool[np.ndarray, " n"]:
-        """Which images neither localize another one nor are localized by one."""
+        """Which images neither localize another image nor are localized by one."""
         return self.degrees(threshold).sum(axis=0) == 0
 
     def num_components(self, threshold: float = 0.05) -> int:
         """Number of weakly connected components."""
         return int(connected_components(self.adjacency(threshold), directed=False, return_labels=False))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GraphRun:
+    """A reference graph and the effort of computing it."""
+
+    graph: ReferenceGraph
+    """The reference graph."""
+
+    pairs_tried: int
+    """Number of unordered pairs of images that were localized from each other, in both directions."""
+
+    seconds: dict[str, float]
+    """Seconds of each stage."""
 
 
 def _check(count: int, pairs: np.ndarray, errors: np.ndarray) -> None:
@@ -81,8 +95,8 @@ def _check(count: int, pairs: np.ndarray, errors: np.ndarray) -> None:
     if len(pairs) == 0:
         return
     if pairs.min() < 0 or pairs.max() >= count:
-        raise ValueError(f"pairs must be of images 0 to {count - 1}, got {pairs.min()} and {pairs.max()}")
+        raise ValueError(f"pairs must be from 0 to {count - 1}, got {pairs.min()} and {pairs.max()}")
     if (pairs[:, 0] == pairs[:, 1]).any():
-        raise ValueError("pairs must be of two different images")
+        raise ValueError("pairs must join two different images")
     if len(np.unique(pairs, axis=0)) < len(pairs):
         raise ValueError("pairs must not repeat")

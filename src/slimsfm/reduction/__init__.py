@@ -1,39 +1,40 @@
-"""From a map to a slim one, and what that costs, told beforehand."""
+"""Reduction of a map: choose images or points to keep, and predict what that costs."""
 
-from slimsfm.reduction.choice import Candidate, Choice, Maker, points_seen
+from slimsfm.reduction.choice import Candidate, Choice, Frontier, apply_choice, points_seen
 from slimsfm.reduction.forecast import Prediction, Trials
-from slimsfm.reduction.frontier import USES, Frontier, FrontierOptions, Weigh, frontier, try_images
-from slimsfm.reduction.images import (
-    Reduction,
-    ReductionOptions,
+from slimsfm.reduction.image_sets import (
+    DominatingSetOptions,
     dominating_set,
     image_order,
     images_within,
     keep_random_images,
-    reduce_map,
 )
-from slimsfm.reduction.recommend import Wish, recommend
+from slimsfm.reduction.limits import ReductionLimits, recommend
+from slimsfm.reduction.pareto import USES, FrontierOptions, GraphProvider, forecast_images, frontier
+from slimsfm.reduction.reduced import ImageOptions, Reduced, ReduceOptions, reduce
 
 __all__ = [
     "USES",
     "Candidate",
     "Choice",
+    "DominatingSetOptions",
     "Frontier",
     "FrontierOptions",
-    "Maker",
+    "GraphProvider",
+    "ImageOptions",
     "Prediction",
-    "Reduction",
-    "ReductionOptions",
+    "ReduceOptions",
+    "Reduced",
+    "ReductionLimits",
     "Trials",
-    "Weigh",
-    "Wish",
+    "apply_choice",
     "dominating_set",
+    "forecast_images",
     "frontier",
     "image_order",
     "images_within",
     "keep_random_images",
     "points_seen",
     "recommend",
-    "reduce_map",
-    "try_images",
+    "reduce",
 ]

@@ -1,4 +1,4 @@
-"""One way to make a map small: what it keeps, what that weighs and what it is predicted to do."""
+"""One way to make a map small: what it keeps, its size, and how it is predicted to localize."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,19 +18,19 @@ DOMINATING = "dominating"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Choice:
-    """What is kept of a map."""
+    """The images or points of a map that are kept."""
 
     use: str
-    """How queries are to be matched with it: "direct" or "images"."""
+    """How queries are matched with the reduced map: "direct" (with points) or "images"."""
 
     method: str
-    """Who chose: a selector of points, or "dominating" for a dominating set of images."""
+    """The selector of the points, or "dominating", "images" or "random" for images."""
 
     detail: str
-    """What the method was asked for."""
+    """The request to the method, such as a number of points."""
 
     images: tuple[str, ...]
-    """The reference images that are kept for matching; none where points are matched directly."""
+    """The reference images that are kept for matching; empty where points are matched directly."""
 
     points: Ids
     """Rows of the points that are kept, ascending."""
@@ -38,19 +38,19 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
-    """A choice and what is known of it."""
+    """A choice with its size and its predicted effect."""
 
     choice: Choice
-    """The choice."""
+    """The images or points that are kept."""
 
     bytes: int
-    """Size of its map on disk."""
+    """Size of the reduced map on disk."""
 
     prediction: Prediction
-    """How references that are left out are localized with it."""
+    """How the reduced map localizes references that are left out."""
 
     full: Prediction
-    """How the full map localizes the same ones."""
+    """How the full map localizes the same references."""
 
     @cached_property
     def losses(self) -> tuple[float, ...]:
@@ -59,36 +59,50 @@ class Candidate:
 
     @property
     def loss(self) -> float:
-        """The largest of the losses."""
+        """The largest of the losses, in percentage points."""
         return max(self.losses)
 
     @property
     def seconds(self) -> float:
-        """Predicted time of matching and pose a query."""
+        """Predicted time of matching and pose per query."""
         return self.prediction.seconds
 
 
-class Maker:
-    """Makes the maps of choices."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frontier:
+    """The choices that were tried on a map."""
 
-    def __init__(self, map: Map) -> None:
-        self._map = map
+    full: Prediction
+    """How the full map, matched image by image, localizes references that are left out."""
 
-    def make(self, choice: Choice) -> Map:
-        """The map that keeps what was chosen."""
-        if choice.use == "images":
-            return keep_images(self._map, choice.images)
-        return direct_map(self._map, self.described(choice.points))
+    candidates: tuple[Candidate, ...]
+    """The choices with their sizes and predictions, by use and method."""
 
-    def described(self, points: Ids) -> PointDescriptors:
-        """Points with their descriptors."""
-        return self._described[points]
+    def is_pareto_dominated(self, one: Candidate) -> bool:
+        """Whether another candidate for the same use is not larger, loses no more, and is better in one."""
+        return any(
+            other.choice.use == one.choice.use
+            and (other.bytes, other.loss) != (one.bytes, one.loss)
+            and other.bytes <= one.bytes
+            and other.loss <= one.loss
+            for other in self.candidates
+        )
 
-    @cached_property
-    def _described(self) -> PointDescriptors:
-        return describe_points(self._map)
+
+def apply_choice(map: Map, choice: Choice, *, described: PointDescriptors | None = None) -> Map:
+    """Create the reduced map that keeps a choice.
+
+    Args:
+        map: The full map.
+        choice: The images or points to keep.
+        described: `describe_points(map)`, if the caller has computed it; used for direct matching only.
+    """
+    if choice.use == "images":
+        return keep_images(map, choice.images)
+    described = describe_points(map) if described is None else described
+    return direct_map(map, described[choice.points])
 
 
 def points_seen(map: Map, images: tuple[str, ...]) -> Ids:
-    """Rows of the points that some images see: the paper's P', ascending."""
+    """Rows of the points that some images see, ascending: P' in the paper."""
     return np.unique(np.concatenate([map.observations[name].points for name in images]))

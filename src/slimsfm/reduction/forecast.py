@@ -1,8 +1,9 @@
-"""What a slim map will do to queries, told beforehand: the references stand in for them.
+"""Predict how a reduced map localizes queries: its references, each left out in turn, serve as queries.
 
-A reference whose own observations are taken out of a map is a query of known pose. Errors, inliers and times
-of localizing many of them foretell those of queries. Queries are less like the references than those are like
-each other, so each test is handicapped: a random part of its right matches, none to half, is taken away.
+A reference whose own observations are removed from the map is a query of known pose. The errors, inliers and
+times of localizing many of them predict those of real queries. Queries resemble the references less than
+these resemble each other, so each test is handicapped: a random share of its correct matches, between none
+and half, is removed.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -15,7 +16,7 @@ from jaxtyping import Float64
 from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
-from slimsfm.arrays import Ids, Mask, Points2D, Points3D
+from slimsfm.arrays import Ids, Mask
 from slimsfm.geometry import corner_error, reprojection_errors
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import Target, unite
@@ -26,33 +27,33 @@ from slimsfm.progress import ProgressBar, silent
 from slimsfm.selection.leave_one_out import LeftOut
 
 _MOST_TESTS = 60
-_LOST = 0.5  # of the right matches of a test, at most
+_LOST = 0.5  # largest share of correct matches that is removed
 _GOLDEN = (5**0.5 - 1) / 2  # its multiples fill the unit interval evenly
-_MOST_REFERENCES = 60  # that a test is matched against; of more, those of most common points
+_MOST_REFERENCES = 60  # matched per test with the full map: those with the most common points
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """How references that are left out are localized."""
+    """How well references that are left out are localized."""
 
     tests: tuple[str, ...]
-    """The references that served as queries."""
+    """Names of the references that served as queries."""
 
     errors: Float64[np.ndarray, " tests"]
-    """Relative corner error of each; infinite where there was no pose."""
+    """Relative corner error of each test; infinite without a pose."""
 
     inliers: Ids
-    """Inliers of each; 0 where there was no pose."""
+    """Number of inliers of each test; 0 without a pose."""
 
     seconds: float
-    """Mean time of matching and pose a query."""
+    """Mean time of matching and pose per query."""
 
     def within(self, fraction: float) -> float:
-        """Percentage of the tests within a fraction of the diagonal."""
+        """Percentage of the tests whose relative corner error is below a fraction."""
         return 100 * float(np.mean(self.errors < fraction)) if len(self.errors) else 0.0
 
     def of(self, tests: Collection[str]) -> "Prediction":
-        """The part that speaks of some of the tests; the time stays that of all."""
+        """The prediction restricted to some tests; the time remains the mean of all."""
         rows = [row for row, name in enumerate(self.tests) if name in tests]
         return replace(
             self,
@@ -75,12 +76,19 @@ class _Trial:
 
 
 class Trials:
-    """Localizes references of a map as if they had never been part of it."""
+    """Localizes references of a map as if they had never been part of it.
 
-    def __init__(self, map: Map, left_out: LeftOut) -> None:
+    Args:
+        map: The full map.
+        left_out: The map without each of its images.
+        clock: Measures matching and pose, in seconds.
+    """
+
+    def __init__(self, map: Map, left_out: LeftOut, *, clock: Callable[[], float] = perf_counter) -> None:
         self._map = map
         self._left_out = left_out
         self._matching = map.descriptor_metric
+        self._clock = clock
         names = list(map.images)
         most = _MOST_TESTS if map.has_keypoints else 0  # a query has no descriptors
         places = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
@@ -89,18 +97,18 @@ class Trials:
         self._common = csr_array(sees @ sees.T)
 
     def points(self, points: Ids) -> Prediction:
-        """Match directly against some points, rows of the map's points in ascending order."""
+        """Match directly against some points, given as ascending rows of the map's points."""
         return self._predict(self.tests, lambda name: [self._described(points, name)])
 
     def images(self, names: Collection[str]) -> Prediction:
-        """Match against some references; only the others are tests."""
+        """Match against some references; only the other references are tests."""
         chosen = [self._reference(name) for name in sorted(names)]
         return self._predict([name for name in self.tests if name not in names], lambda _: chosen)
 
     def full(self, tests: Collection[str], progress: ProgressBar = silent) -> Prediction:
         """Match some of the tests against all other references.
 
-        Where these are many, just the nearest are matched, and the time is scaled up.
+        If there are more than 60, only the nearest are matched, and the time is scaled up.
         """
         used = min(_MOST_REFERENCES, len(self._map.images) - 1)
         found = self._predict(progress(list(tests), "localize with the full map"), self._nearest)
@@ -108,7 +116,7 @@ class Trials:
 
     def _predict(self, tests: Iterable[str], targets: Callable[[str], list[Target]]) -> Prediction:
         names, found = [], []
-        with threadpool_limits(1):  # products on several threads may round otherwise: no choice hangs on that
+        with threadpool_limits(1):  # products on several threads may round differently
             for name in tests:
                 names.append(name)
                 found.append(self._try(name, targets(name)))
@@ -121,26 +129,19 @@ class Trials:
 
     def _try(self, name: str, targets: list[Target]) -> _Trial:
         query, camera = self._left_out.query(name), self._map.camera(name)
-        start = perf_counter()
+        start = self._clock()
         matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
-        seconds = perf_counter() - start
+        seconds = self._clock() - start
         points2D = query.keypoints[matches.keypoints]
         points3D = self._map.points3D_in_world[matches.points]
-        kept = self._handicap(name, points2D, points3D)
-        start = perf_counter()
+        true_pose = self._map.images[name].cam_from_world()
+        errors = reprojection_errors(points2D, points3D, true_pose, camera)
+        kept = handicap(errors, self.tests.index(name))
+        start = self._clock()
         pose = estimate_pose(points2D[kept], points3D[kept], camera)
-        seconds += perf_counter() - start
+        seconds += self._clock() - start
         error, inliers = self._error(name, pose), pose.num_inliers if pose else 0
         return _Trial(error=error, inliers=inliers, seconds=seconds)
-
-    def _handicap(self, name: str, points2D: Points2D, points3D_in_world: Points3D) -> Mask:
-        """Which matches a query less like the references would have had as well."""
-        pose = self._map.images[name].cam_from_world()
-        errors = reprojection_errors(points2D, points3D_in_world, pose, self._map.camera(name))
-        place = self.tests.index(name)
-        share = 1 - _LOST * (place * _GOLDEN % 1)
-        drawn = np.random.default_rng(place).random(len(points2D)) < share
-        return drawn | (errors > RansacOptions().max_error_px)
 
     def _error(self, name: str, pose: PoseEstimate | None) -> float:
         if pose is None:
@@ -164,3 +165,15 @@ class Trials:
     @lru_cache(maxsize=4 * _MOST_REFERENCES)  # noqa: B019, trials are few and short-lived
     def _reference(self, name: str) -> Target:
         return reference_target(self._map, name)
+
+
+def handicap(errors_px: Float64[np.ndarray, " n"], test: int) -> Mask:
+    """Decide which matches of a test are kept: those that a less similar query would have had as well.
+
+    Args:
+        errors_px: Reprojection error of each match at the true pose. Wrong matches are always kept.
+        test: Number of the test; it determines the share that is removed, and which matches.
+    """
+    share = 1 - _LOST * (test * _GOLDEN % 1)
+    drawn = np.random.default_rng(test).random(len(errors_px)) < share
+    return drawn | (errors_px > RansacOptions().max_error_px)

@@ -6,10 +6,10 @@ from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options, parse_
 from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.evaluation.variants import parse_variant
 from slimsfm.graph import ReferenceGraph
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
-from slimsfm.reduction import ReductionOptions
+from slimsfm.reduction import DominatingSetOptions
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ def open_object(run: Run, result: ObjectResult, method: str) -> OpenedObject:
     maps = {variant: read_map(run.map_path(result.name, method, variant)) for variant in kept}
     threshold = run.options["reduction"]["threshold"]
     asked = BenchmarkOptions(
-        edges=run.options["edges"], reduction=ReductionOptions(threshold=threshold)
+        edges=run.options["edges"], reduction=DominatingSetOptions(threshold=threshold)
     )  # all that the graph depends on
     options = graph_options(asked, parse_method(method))
     return OpenedObject(

@@ -1,4 +1,4 @@
-"""Lazy greedy maximization [1]: gains only fall, so one computed earlier bounds today's from above.
+"""Lazy greedy maximization [1]: gains never rise, so an earlier gain bounds the current one from above.
 
 References:
     [1] Minoux, Accelerated greedy algorithms for maximizing submodular set functions, 1978.
@@ -15,23 +15,23 @@ Gains = Float64[np.ndarray, " n"]
 Some = Int64[np.ndarray, " m"]
 
 _NEGLIGIBLE = 1e-9
-_FRONT = 4096  # items of the largest bounds, which are searched for the best; or a share of all, if more
+_FRONT = 4096  # items with the largest bounds, among which the best is searched; at least a share of all
 _SHARE = 64
-_BATCH = 32  # gains evaluated at once at first; twice as many each time that they do not decide
+_BATCH = 32  # gains evaluated at once; doubled each time that they do not decide
 
 
 def greedy_order(first_gains: Gains, gains: Callable[[Ids], Gains], allowed: Mask) -> Iterator[int]:
-    """Yield, again and again, the item of the largest gain until none gains anything.
+    """Yield the item of the largest gain repeatedly, until no item has a gain.
 
     Args:
         first_gains: Upper bounds of the gains.
-        gains: The gains of items now; must not rise when items are chosen.
+        gains: The current gains of items; they must not rise when items are chosen.
         allowed: Which items may be chosen.
 
     Notes:
-        The caller makes the choice of a yielded item count before it asks for the next. Ties go to the lower
-        item. Bounds are kept for all items but searched only among the largest, some thousands, until those
-        have fallen below the rest; gains are evaluated in batches, at most about twice as many as [1] would.
+        The caller must apply the choice of an item before it requests the next one. Ties go to the lower
+        index. Bounds are kept for all items but searched only among the largest, some thousands, until those
+        have fallen below the rest; gains are evaluated in batches, at most about twice as many as in [1].
     """
     bounds = np.where(allowed, first_gains, 0.0)
     while bounds.max(initial=0.0) > _NEGLIGIBLE:
@@ -40,7 +40,7 @@ def greedy_order(first_gains: Gains, gains: Callable[[Ids], Gains], allowed: Mas
 
 
 def _largest(bounds: Gains) -> tuple[Some, int | None]:
-    """The items of the largest bounds, ascending, and the best of the rest; equal ones go by their number."""
+    """The items of the largest bounds, ascending, and the best of the rest; ties are broken by index."""
     size = max(_FRONT, len(bounds) // _SHARE)
     if len(bounds) <= size:
         return np.arange(len(bounds)), None

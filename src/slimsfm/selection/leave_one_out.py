@@ -1,4 +1,4 @@
-"""A map as it would describe its points had one of its images never been taken."""
+"""The points of a map as described without one of its images."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,37 +11,37 @@ from slimsfm.features import unit_rows
 from slimsfm.localization.point_descriptors import descriptor_sums
 from slimsfm.mapping.map import Map
 
-_CACHED = 64  # images whose descriptors are kept at hand
-_NOTHING_LEFT = 1e-3  # length of the sum of no descriptors, but for rounding
+_CACHED = 64  # images whose descriptors are cached
+_NOTHING_LEFT = 1e-3  # a sum of descriptors shorter than this is empty up to rounding errors
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Query:
-    """An image as a query."""
+class LeftOutImage:
+    """An image that is left out of the map and serves as a query."""
 
     keypoints: Points2D
-    """Its keypoints."""
+    """Pixels of its keypoints."""
 
     descriptors: Descriptors
-    """For each of them its descriptor."""
+    """Unit descriptor of each keypoint."""
 
 
 class LeftOut:
-    """Describes points by their observations in all images but one, so that the one can be a query."""
+    """Describes points by their observations in all images but one, so that this one can be a query."""
 
     def __init__(self, map: Map) -> None:
         self._map = map
         self._sums = descriptor_sums(map)
         self.query = lru_cache(maxsize=_CACHED)(self._query)
 
-    def _query(self, name: str) -> "Query":
+    def _query(self, name: str) -> LeftOutImage:
         features = self._map.features[name]
-        return Query(
+        return LeftOutImage(
             keypoints=features.keypoints.astype(np.float64), descriptors=unit_rows(features.descriptors)
         )
 
     def describe(self, points: Ids, name: str) -> Float32[np.ndarray, "n d"]:
-        """The points' mean descriptors without the image; zeros, which match nothing, where none is left.
+        """Mean descriptors of points without the image; zeros, which match nothing, if no other sees them.
 
         Args:
             points: Rows of the map's points, ascending.

@@ -21,10 +21,10 @@ PRIOR_SIGMA = 0.01
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SelectionProblem:
-    """Points, the images that can use them, and what each use says of the image's pose.
+    """Points, the images that can use them, and the information of each use on the image's pose.
 
     Raises:
-        ValueError: The arrays do not fit each other.
+        ValueError: The lengths of the arrays do not match.
     """
 
     usable: csr_array
@@ -58,7 +58,7 @@ class SelectionProblem:
         return (self.usable.shape or (0, 0))[1]  # scipy declares that it may be None
 
     @cached_property
-    def points_an_image(self) -> Int64[np.ndarray, " images"]:
+    def points_per_image(self) -> Int64[np.ndarray, " images"]:
         """How many points each image can use."""
         return np.diff(self.usable.indptr).astype(np.int64)
 
@@ -72,7 +72,7 @@ class SelectionProblem:
         return ImagesOfPoints(images=images[order], uses=order, starts=starts)
 
     def information(self, points: Ids | None = None) -> Float64[np.ndarray, "images 6 6"]:
-        """What the prior and the chosen points (None: all) say of each image's pose, at sigma 1 px."""
+        """Information on each image's pose from the prior and the chosen points (None: all), at 1 px."""
         total = np.tile(np.eye(6) / PRIOR_SIGMA**2, (self.num_images, 1, 1))
         wanted = np.ones(self.num_points, bool)
         if points is not None:
@@ -103,7 +103,7 @@ class ImagesOfPoints:
     """The image of each use."""
 
     uses: Int64[np.ndarray, " uses"]
-    """Its row in `SelectionProblem.twists`."""
+    """Row of each use in `SelectionProblem.twists`."""
 
     starts: Int64[np.ndarray, " points_and_1"]
     """Where each point's uses begin."""
@@ -121,28 +121,28 @@ class ImagesOfPoints:
 
 
 class Selector(Protocol):
-    """A method to choose points: all take these arguments."""
+    """A method that chooses points."""
 
     def __call__(self, problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
         """Choose points.
 
         Args:
-            problem: The points and who can use them.
-            count: How many points are wanted.
-            seed: Settles what is left to chance.
+            problem: The points and the images that can use them.
+            count: Number of points to choose.
+            seed: Equal problems and seeds give equal points.
 
         Returns:
-            Points in the order of their choice: the best first. Fewer than wanted only where no image can use
-            any more of them.
+            Points in the order of their choice, the best first. They are fewer than `count` only if no image
+            can use any further point.
         """
         ...
 
 
-def check_count(count: int) -> None:
-    """Refuse a number of points that cannot be chosen.
+def check_point_count(count: int) -> None:
+    """Check a number of points.
 
     Raises:
-        ValueError: It is not positive.
+        ValueError: `count` is not positive.
     """
     if count < 1:
         raise ValueError(f"count must be positive, got {count}")
@@ -151,9 +151,9 @@ def check_count(count: int) -> None:
 def most_cover(problem: SelectionProblem, count: int) -> int:
     """An upper bound of the K for which `count` points can be such that each image uses K, or all it can.
 
-    The points of the most uses cannot have fewer uses than the images want.
+    The most used points must have as many uses as the images require.
     """
     images_a_point = np.sort(np.diff(problem.images_of.starts))
-    images_of_at_least = np.bincount(problem.points_an_image)[::-1].cumsum()[::-1][1:]
+    images_of_at_least = np.bincount(problem.points_per_image)[::-1].cumsum()[::-1][1:]
     wanted = np.cumsum(images_of_at_least)
     return int(np.searchsorted(wanted, images_a_point[::-1][:count].sum(), side="right"))

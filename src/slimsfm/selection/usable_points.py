@@ -1,9 +1,9 @@
-"""The selection problem of a map: who can use which point, and what that says of the pose.
+"""The selection problem of a map: which images can use which points, and their information on the pose.
 
-An image uses a point if a query that looks like the image would match it rightly. That is found out by doing
-it: the image's own descriptors are taken out of the points it sees, then its keypoints are matched against
-the points near it, and a match that projects where it was found counts. A point of a faint or ambiguous
-descriptor, or one that no second image describes, drops out by itself.
+An image can use a point if a query that looks like the image would match it correctly. This is tested: the
+image's own descriptors are removed from the points it sees, its keypoints are matched against the points near
+it, and matches with a small reprojection error count. A point with a weak or ambiguous descriptor, or one
+that no second image describes, is not usable.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ from slimsfm.progress import ProgressBar, silent
 from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem, Twists
 
-_MAX_ERROR_PX = 4.0  # of a right match
-_NEIGHBOURS = 20  # images whose points an image is matched against: those of most common points
+_MAX_ERROR_PX = 4.0  # of a correct match
+_NEIGHBORS = 20  # other images whose points are matched: those with the most common points
 
 
 def selection_problem(map: Map, left_out: LeftOut, progress: ProgressBar = silent) -> SelectionProblem:
@@ -49,14 +49,14 @@ def selection_problem(map: Map, left_out: LeftOut, progress: ProgressBar = silen
 
 
 def _points_near(map: Map) -> list[Ids]:
-    """For each image the points, ascending, that it or its neighbours observe."""
+    """For each image the points, ascending, that it or its neighbors observe."""
     sees = observed(map)
     common = csr_array(sees.astype(np.int32) @ sees.T.astype(np.int32))
     near = []
     for row in range(len(map.images)):
         others = slice(common.indptr[row], common.indptr[row + 1])
         best = np.argsort(np.negative(common.data[others]), kind="stable")
-        images = common.indices[others][best][: _NEIGHBOURS + 1]  # itself among them
+        images = common.indices[others][best][: _NEIGHBORS + 1]  # itself among them
         near.append(np.unique(sees[images].indices).astype(np.int64))
     return near
 
@@ -75,7 +75,7 @@ def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.nda
 
 
 def _twists(map: Map, name: str, points: Ids) -> Twists:
-    """Of an ideal pinhole camera: lens distortion changes little of what a match says of the pose."""
+    """Twists of an ideal pinhole camera: lens distortion hardly changes the information of a match."""
     in_cam = map.images[name].cam_from_world() * map.points3D_in_world[points]
     twists = projection_jacobian(in_cam, map.camera(name).mean_focal_length())
     return (twists * _in_diagonals(map.box.diagonal)).astype(np.float32)

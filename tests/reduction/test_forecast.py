@@ -1,4 +1,4 @@
-"""References that are left out foretell queries."""
+"""References that are left out predict queries."""
 
 from dataclasses import replace
 from itertools import count, pairwise
@@ -9,7 +9,8 @@ import pytest
 from scenes import exact_map
 from slimsfm.features import unit_rows
 from slimsfm.pose import RansacOptions
-from slimsfm.reduction import Prediction, Trials, trial
+from slimsfm.reduction import Prediction, Trials
+from slimsfm.reduction.forecast import handicap
 from slimsfm.selection.leave_one_out import LeftOut
 
 LOST_AT_MOST = 0.5
@@ -31,7 +32,7 @@ def partial():
 
 @pytest.fixture(scope="module")
 def strangers(exact):
-    """The exact scene with descriptors that no two images agree on."""
+    """The exact scene with random descriptors, different in every image."""
     rng = np.random.default_rng(0)
     features = {
         name: replace(one, descriptors=unit_rows(rng.normal(size=one.descriptors.shape)))
@@ -40,11 +41,10 @@ def strangers(exact):
     return replace(exact, features=features)
 
 
-@pytest.fixture
-def ticking(monkeypatch):
-    """A clock by which every stage of every test takes one second."""
+def timed_trials(map_):
+    """Trials whose clock says that every stage of every test takes one second."""
     ticks = count()
-    monkeypatch.setattr(trial, "perf_counter", lambda: float(next(ticks)))
+    return Trials(map_, LeftOut(map_), clock=lambda: float(next(ticks)))
 
 
 def prediction(errors, inliers=None):
@@ -63,9 +63,9 @@ def test_shares_count_errors_below_a_fraction():
     assert prediction([np.inf, np.inf, 0.1]).median_error == np.inf
 
 
-def test_the_part_of_some_tests_is_theirs():
+def test_a_prediction_can_be_restricted_to_some_tests():
     found = prediction([0.1, 0.2, 0.3], [5, 6, 7])
-    part = found.of({"2.png", "0.png", "nobody.png"})
+    part = found.of({"2.png", "0.png", "missing.png"})
     assert part.tests == ("0.png", "2.png")
     assert part.errors.tolist() == [0.1, 0.3]
     assert part.inliers.tolist() == [5, 7]
@@ -73,14 +73,14 @@ def test_the_part_of_some_tests_is_theirs():
     assert found.of(found.tests).errors.tolist() == found.errors.tolist()
 
 
-def test_no_tests_tell_nothing():
+def test_without_tests_nothing_is_predicted():
     nothing = prediction([0.1]).of(())
     assert nothing.tests == ()
     assert nothing.within(0.1) == 0.0
     assert nothing.median_error == np.inf
 
 
-def test_on_an_exact_scene_nothing_is_off(exact):
+def test_on_an_exact_scene_all_errors_are_zero(exact):
     trials, names = trials_of(exact), list(exact.images)
     assert trials.tests == tuple(names)
     by_points, by_images = trials.points(rows_of(exact)), trials.images(names[:2])
@@ -101,10 +101,9 @@ def test_a_reference_does_not_help_to_localize_itself(strangers):
         assert found.within(1e9) == 0.0
 
 
-@pytest.mark.usefixtures("ticking")
 def test_only_some_are_left_out_where_there_are_many():
     many = exact_map(70, 30)
-    trials, names = trials_of(many), list(many.images)
+    trials, names = timed_trials(many), list(many.images)
     assert len(set(trials.tests)) == 60
     assert list(trials.tests) == sorted(trials.tests)
     assert (trials.tests[0], trials.tests[-1]) == (names[0], names[-1])
@@ -114,9 +113,8 @@ def test_only_some_are_left_out_where_there_are_many():
     assert trials.full(trials.tests[:3]).seconds == pytest.approx(2 * 69 / 60)
 
 
-@pytest.mark.usefixtures("ticking")
 def test_the_time_of_a_full_map_is_measured_where_images_are_few(exact):
-    assert trials_of(exact).full(list(exact.images)[:2]).seconds == 2
+    assert timed_trials(exact).full(list(exact.images)[:2]).seconds == 2
 
 
 def test_equal_maps_give_equal_predictions(partial):
@@ -147,22 +145,13 @@ def test_points_that_nobody_sees_localize_nobody(exact):
     assert np.isinf(found.errors).all()
 
 
-def matches_of(map_, name, off_px):
-    """Every observation of an image, shifted."""
-    seen = map_.observations[name]
-    keypoints = map_.features[name].keypoints[seen.rows].astype(np.float64)
-    return keypoints + np.array([off_px, 0.0]), map_.points3D_in_world[seen.points]
+@pytest.mark.parametrize("test", range(20))
+def test_wrong_matches_are_all_kept(test):
+    assert handicap(np.full(400, 2 * RansacOptions().max_error_px), test).all()
 
 
-def test_wrong_matches_are_all_kept(partial):
-    trials = trials_of(partial)
-    for name in partial.images:
-        assert trials._handicap(name, *matches_of(partial, name, 2 * RansacOptions().max_error_px)).all()
-
-
-def test_of_right_matches_half_are_lost_at_most_on_average():
-    trials = trials_of(many := exact_map(40, 400))
-    kept = np.array([trials._handicap(name, *matches_of(many, name, 0.0)).mean() for name in trials.tests])
+def test_at_most_half_of_the_correct_matches_are_removed_on_average():
+    kept = np.array([handicap(np.zeros(400), test).mean() for test in range(40)])
     assert kept[0] == 1.0
     assert kept.min() > LOST_AT_MOST - 0.1
     assert kept.mean() == pytest.approx(1 - LOST_AT_MOST / 2, abs=0.03)

@@ -1,11 +1,11 @@
-"""Our selector: K-cover in which a use counts for more the more it says of its image's pose.
+"""The default selector: K-cover that weights each use of a point by its information on the image's pose.
 
-A use of a point by an image, with twist J, adds the information J'J to the image's pose. Its worth is
-1 + w log det(I + J C J') where C is the covariance of the pose given the points chosen so far: one match
-more for the image, and what that match tells, which is little where the chosen points lie already. Points
-are chosen greedily by the worth of all their uses in images that are not satisfied yet. An image is satisfied
-when it can use K of the chosen points, or all it has if those are fewer, and its predicted corner error is as
-small as K points drawn at random from its own would make it: the target follows what the full map can do.
+A use of a point by an image, with twist J, adds the information J'J to the image's pose. Its value is 1 + w
+log det(I + J C J'), where C is the covariance of the pose given the points chosen so far: one more match for
+the image, and the information of that match, which is small near points that are chosen already. Points are
+chosen greedily by the value of their uses in all images that are not satisfied so far. An image is satisfied
+when it can use K of the chosen points, or all of its points if they are fewer, and when its predicted corner
+error is as small as with K random points of its own.
 """
 
 from bisect import bisect_right
@@ -21,24 +21,24 @@ from slimsfm.selection.problem import (
     PRIOR_SIGMA,
     SelectionProblem,
     Twists,
-    check_count,
+    check_point_count,
     most_cover,
 )
 
-_WEIGHT = 0.5  # of what a match tells against that it is a match
-_FIRST_COVER = 8  # points an image
+_WEIGHT = 0.5  # of the information of a match relative to its count
+_FIRST_COVER = 8  # points per image
 _GROWTH = 1.25  # from one K to the next
 
 
 def information(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:  # noqa: ARG001
     """Choose the points that determine the poses of all images best.
 
-    The largest K of 8, 10, 13, ... is taken at which `count` points satisfy all images; what is left of the
-    budget goes towards the next K. Nothing is left to chance.
+    K is the largest of 8, 10, 13, ... at which `count` points satisfy all images; the remaining points are
+    spent on the next K. The choice is deterministic.
 
     Args:
-        problem: The points and who can use them.
-        count: How many points are wanted.
+        problem: The points and the images that can use them.
+        count: Number of points to choose.
         seed: Unused.
 
     Returns:
@@ -48,17 +48,16 @@ def information(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
         ValueError: `count` is not positive.
 
     Notes:
-        A round evaluates every use once at first, and after that gains, which never rise, lazily: some
-        hundred for each choice in practice. O(log log(points an image)) rounds for one budget; a round that
-        exceeds it is broken off.
+        A round evaluates every use once and then gains, which never rise, lazily: some hundred per choice in
+        practice. There are O(log log(points per image)) rounds; a round that exceeds `count` is stopped.
     """
-    check_count(count)
+    check_point_count(count)
     covers = _covers(problem)
-    choice = _Choice(problem)
+    choice = InformationChoice(problem)
     low, high = 0, max(bisect_right(covers, most_cover(problem, count)) - 1, 0)
     while low < high:
         middle = (low + high + 1) // 2
-        tried = _Choice(problem)
+        tried = InformationChoice(problem)
         if tried.extend(covers[middle], count + 1) <= count:
             low, choice = middle, tried
         else:
@@ -70,16 +69,16 @@ def information(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
 
 
 def _covers(problem: SelectionProblem) -> list[int]:
-    """The values of K to try; the last asks for every point that an image can use."""
-    most = int(problem.points_an_image.max(initial=1))
+    """The values of K to try; the last one requires every point that an image can use."""
+    most = int(problem.points_per_image.max(initial=1))
     covers = [_FIRST_COVER]
     while covers[-1] < most:
         covers.append(min(int(np.ceil(covers[-1] * _GROWTH)), most))
     return covers
 
 
-class _Choice:
-    """The points chosen so far and what they do for each image."""
+class InformationChoice:
+    """The points chosen so far and their effect on each image."""
 
     def __init__(self, problem: SelectionProblem) -> None:
         self.chosen: list[int] = []
@@ -93,7 +92,7 @@ class _Choice:
         self._free = np.ones(problem.num_points, bool)
 
     def extend(self, cover: int, count: int) -> int:
-        """Choose until `count` points are chosen or all images are satisfied; gives the number chosen."""
+        """Choose until `count` points are chosen or all images are satisfied; returns the number chosen."""
         for point in self._order(cover):
             if len(self.chosen) >= count:
                 break
@@ -101,7 +100,7 @@ class _Choice:
         return len(self.chosen)
 
     def _order(self, cover: int) -> Iterator[int]:
-        usable = self._problem.points_an_image
+        usable = self._problem.points_per_image
         self._needed = np.minimum(cover, usable)
         self._target = self._problem.best_corner_errors * np.sqrt(np.maximum(usable / cover, 1)) * (1 + 1e-6)
         self._open = (self._seen < self._needed) | (self._error > self._target)
@@ -128,7 +127,7 @@ class _Choice:
         return np.bincount(owners, worth, minlength=len(points)).astype(np.float64)
 
     def _all_gains(self) -> Gains:
-        """The gains of all points, and a little more, so that rounding does not make a bound too low."""
+        """Upper bounds of the gains of all points, slightly raised against rounding errors."""
         gains = np.zeros(self._problem.num_points)
         starts = self._problem.usable.indptr
         for image in np.flatnonzero(self._open):
@@ -139,7 +138,7 @@ class _Choice:
 
 
 def _worth(twists: Twists, covariances: Float64[np.ndarray, "m 6 6"]) -> Gains:
-    """What uses are worth to poses of these covariances, one each or one for all."""
+    """The value of uses to poses of these covariances, one per use or one for all."""
     pixels = twists.astype(np.float64)
     moved = pixels @ covariances
     (u, v), uv = np.vecdot(moved, pixels).T, np.vecdot(moved[:, 0], pixels[:, 1])

@@ -1,4 +1,4 @@
-"""The paper's solver: the best of many random maximal choices."""
+"""The solver of the paper: the best of many random maximal choices."""
 
 from time import perf_counter
 
@@ -13,21 +13,20 @@ from slimsfm.domination.solution import Bounds, Solution, merit, solution_of
 def random_greedy(problem: DominationProblem, *, draws: int = 1000, seed: int = 0) -> Solution:
     """Find a small dominating set by drawing many at random.
 
-    Algorithm 2 of [1]: choose a random node of the remaining ones, remove it and its out-neighbours, until
-    none remains. The best of all draws wins, the first found among equals.
+    Algorithm 2 of [1]: choose a random remaining node and remove it and its out-neighbors, until none
+    remains. The best of all draws wins, the first found among equals.
 
-    Beyond [1], the nodes forced in come first, and a node remains until it has what it asks for. One that is
-    forced out cannot be chosen; random ones of its in-neighbours are, until it has enough, and so it is with
-    groups. Under a budget a node that no longer fits is passed over.
+    Beyond [1], a node remains until its requirement is met, and random members of a group are chosen until
+    the group has one. Under a budget a node that no longer fits is skipped.
 
     Args:
-        problem: What to meet.
-        draws: How many sets are drawn; [1] takes 1000.
+        problem: The graph and its requirements.
+        draws: Number of sets that are drawn; 1000 in [1].
         seed: Equal problems, draws and seeds give equal solutions.
 
     Returns:
-        A dominating set. Its lower bound on the cost is that of a packing of the nodes; it is seldom tight,
-        and optimality seldom proven. Under a budget it is that of the nodes forced in.
+        A dominating set. Its lower bound on the cost is that of a packing of the nodes; it is rarely tight,
+        so optimality is rarely proven. Under a budget there is no bound.
 
     Raises:
         ValueError: `draws` is not positive.
@@ -49,13 +48,12 @@ def random_greedy(problem: DominationProblem, *, draws: int = 1000, seed: int = 
         best = min(sets, key=lambda chosen: float(problem.costs[chosen].sum()))
     else:
         best = min(sets, key=lambda chosen: merit(problem, tuple(sorted(chosen))))
-    bound = problem.cost(problem.forced_in)
-    bound += dual_bound(drawn.cover) if problem.budget is None else 0
+    bound = dual_bound(drawn.cover) if problem.budget is None else 0
     return solution_of(problem, tuple(sorted(best)), Bounds(cost=bound), start)
 
 
 class _Draws:
-    """A problem made ready for many draws."""
+    """A problem prepared for many draws."""
 
     def __init__(self, problem: DominationProblem) -> None:
         self.problem = problem
@@ -67,9 +65,9 @@ class _Draws:
         self.own = _own_nodes(problem).tolist()
 
     def draw(self, rng: np.random.Generator) -> list[int]:
-        """Walk through a random order: its next remaining node is a uniform choice of the remaining ones."""
+        """Visit the rows in random order: each is a uniform choice among the remaining ones."""
         residual = self.cover.needs.copy()
-        chosen = list(self.problem.forced_in)
+        chosen: list[int] = []
         left = self.cover.budget * (1 + 1e-12)
         for row in rng.permutation(len(residual)).tolist():
             if residual[row] <= 0:
@@ -83,17 +81,14 @@ class _Draws:
         return chosen
 
     def _others(self, row: int, chosen: list[int], rng: np.random.Generator) -> list[int]:
-        """Whom to choose for a row whose own node may not be chosen: its other members, at random."""
+        """The members of a group that are not chosen, in random order."""
         members = np.setdiff1d(self.members[row], chosen)
         return rng.permutation(members).tolist()
 
 
 def _own_nodes(problem: DominationProblem) -> Ids:
-    """The node of each row of the problem's cover; -1 for nodes forced out and for groups."""
-    matrix, needs = problem.requirements
+    """The node of each row of the problem's cover; -1 for groups."""
+    _, needs = problem.requirements
     nodes = np.full(len(needs), -1, dtype=np.int64)
     nodes[: problem.num_nodes] = np.arange(problem.num_nodes)
-    nodes[list(problem.forced_out)] = -1
-    indicator = np.zeros(problem.num_nodes, dtype=np.int64)
-    indicator[list(problem.forced_in)] = 1
-    return nodes[needs - matrix @ indicator > 0]
+    return nodes[needs > 0]

@@ -1,4 +1,10 @@
-"""From a map to a slim one: keep a dominating set of the reference images and the points they see."""
+"""Sets of reference images to keep: dominating sets, orders of all images, and random images.
+
+A dominating set and the points it sees are the X' and P' of the paper [1].
+
+References:
+    [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set, 2025.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from slimsfm.domination import SOLVERS, DominationProblem, Solution, cover_order
-from slimsfm.domination.swaps import least_error_by_swaps
+from slimsfm.domination.local_search import least_error_by_swaps
 from slimsfm.errors import InputError
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping.map import Map
@@ -17,40 +23,40 @@ from slimsfm.reduction.rim import rim_groups
 
 Cost = Literal["image", "observations"]
 
-_PAPER = "random"  # the solver whose sets are left as they are
+_PAPER = "random"  # the solver whose sets are not improved by swaps
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReductionOptions:
-    """Which reference images to keep."""
+class DominatingSetOptions:
+    """How a dominating set of the reference images is chosen."""
 
     threshold: float = 0.05
     """Largest relative corner error of a pose for which an image counts as localized."""
 
     solver: str = "exact"
-    """Who chooses the dominating set: "exact" (minimum, proven), "cpsat" (the same for thousands of images,
-    with OR-Tools), "greedy" (fast) or "random" (the paper's)."""
+    """Solver: "exact" (proven minimum), "cpsat" (the same for thousands of images, with OR-Tools), "greedy"
+    (fast) or "random" (the paper's)."""
 
     seed: int = 0
-    """Seed of every random choice."""
+    """Seed of all random choices."""
 
     dominators: int = 1
-    """How many kept images localize each one that is not kept, or all that can where there are fewer."""
+    """Number of kept images that localize each image that is not kept, or all that can if they are fewer."""
 
     rim: bool = False
-    """Localize the images at the rim of the capture from images nearly as far out, and keep each part of the
-    object's surface in sight: queries from the rim find fewer images on one side than others do."""
+    """Localize the images at the rim of the capture from images nearly as far out, and keep an image of each
+    part of the object's surface: queries at the rim have reference images on one side only."""
 
     cost: Cost = "image"
-    """What is to be least: the number of images kept, or that of their observations, with which memory and
-    the time of exhaustive matching grow."""
+    """What to minimize: the number of kept images, or of their observations, which determines memory and the
+    time of exhaustive matching."""
 
     max_images: int | None = None
-    """Keep at most so many images. Those that localize the most are kept where this is too few for all."""
+    """Largest number of images. If it is too small to localize all others, as many as possible are."""
 
     best: bool = False
-    """Prove that of the smallest sets the one with the least sum of errors is taken, which may take a minute
-    for 50 images. Without it swaps come near in a moment. The paper's solver takes its first set as it is."""
+    """Find the set with the proven least sum of errors among the smallest sets, which may take a minute for
+    50 images. Otherwise swaps reduce the sum quickly. The sets of the paper's solver are not improved."""
 
     def __post_init__(self) -> None:
         if not self.threshold > 0:
@@ -69,48 +75,19 @@ class ReductionOptions:
             raise ValueError(f"max_images limits a number of images: cost must be image, got {self.cost!r}")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Reduction:
-    """A slim map and how its images were chosen."""
-
-    map: Map
-    """The slim map."""
-
-    solution: Solution
-    """The dominating set, with what is known of its optimality."""
-
-
-def reduce_map(map: Map, graph: ReferenceGraph, options: ReductionOptions = ReductionOptions()) -> Reduction:
-    """Keep a dominating set of the reference images and the points they see: the paper's X' and P' [1].
-
-    Args:
-        map: The map.
-        graph: Its reference graph.
-        options: How to choose.
-
-    Raises:
-        ValueError: The graph is of another map.
-
-    References:
-        [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set, 2025.
-    """
-    solution = dominating_set(graph, options, map)
-    return Reduction(map=keep_images(map, (graph.names[i] for i in solution.chosen)), solution=solution)
-
-
-def dominating_set(graph: ReferenceGraph, options: ReductionOptions, map: Map | None = None) -> Solution:
-    """Choose the images that localize all others, by index into the graph's names.
+def dominating_set(graph: ReferenceGraph, options: DominatingSetOptions, map: Map | None = None) -> Solution:
+    """Choose images that localize all others, as indices into the graph's names.
 
     Args:
         graph: The reference graph.
-        options: How to choose. A limit on the images that suffices changes nothing.
+        options: How to choose. A limit on the images that is large enough has no effect.
         map: The map of the graph; only `rim` and costs other than "image" need it.
 
     Returns:
-        The images. What it says of optimality is of their number or cost; of their errors only with `best`.
+        The images. Optimality refers to their number or cost; to their errors only with `best`.
 
     Raises:
-        ValueError: The options need the map, or the graph is of another map.
+        ValueError: The options need the map, or the graph belongs to another map.
     """
     problem = _problem(graph, options, map)
     found = SOLVERS[options.solver](problem, seed=options.seed)
@@ -123,11 +100,12 @@ def dominating_set(graph: ReferenceGraph, options: ReductionOptions, map: Map | 
     return replace(found, chosen=chosen, cost=problem.cost(chosen), unmet=problem.num_unmet(chosen))
 
 
-def image_order(graph: ReferenceGraph, options: ReductionOptions, map: Map | None = None) -> tuple[str, ...]:
-    """Order all images such that every first few of them localize as many others as so few can, or nearly.
+def image_order(
+    graph: ReferenceGraph, options: DominatingSetOptions, map: Map | None = None
+) -> tuple[str, ...]:
+    """Order all images such that each prefix localizes nearly as many others as any set of its size.
 
     The dominating set comes first, then images that localize others a second time, a third time and so on.
-    Who stops anywhere has a good set, and the next image only adds to it.
 
     Args:
         graph: The reference graph.
@@ -135,7 +113,7 @@ def image_order(graph: ReferenceGraph, options: ReductionOptions, map: Map | Non
         map: The map of the graph; only `rim` and costs other than "image" need it.
 
     Raises:
-        ValueError: The options need the map, or the graph is of another map.
+        ValueError: The options need the map, or the graph belongs to another map.
     """
     first = dominating_set(graph, options, map).chosen
     order = cover_order(_problem(graph, options, map), first=first)
@@ -143,14 +121,14 @@ def image_order(graph: ReferenceGraph, options: ReductionOptions, map: Map | Non
 
 
 def images_within(order: tuple[str, ...], fits: Callable[[tuple[str, ...]], bool]) -> tuple[str, ...]:
-    """The longest beginning of an order of images that keeps to a limit, in bytes or points or else.
+    """The longest prefix of an order of images that is within a limit, such as bytes or points.
 
     Args:
         order: Names, the most important first.
-        fits: Whether some images keep to the limit. More images must not keep to it where fewer do not.
+        fits: Whether images are within the limit. If a prefix is not, no longer one may be.
 
     Returns:
-        The first of the names, in order; none where the first one alone is too much.
+        The first names, in order; empty if the first one alone exceeds the limit.
 
     Notes:
         Bisection: `fits` is called about log2(len(order)) times.
@@ -166,10 +144,10 @@ def images_within(order: tuple[str, ...], fits: Callable[[tuple[str, ...]], bool
 
 
 def _problem(
-    graph: ReferenceGraph, options: ReductionOptions, map: Map | None, budget: int | None = None
+    graph: ReferenceGraph, options: DominatingSetOptions, map: Map | None, budget: int | None = None
 ) -> DominationProblem:
     if map is not None and graph.names != tuple(map.images):
-        raise ValueError("graph must be of this map, but its images are others")
+        raise ValueError("graph must have the images of this map, but it has others")
     adjacency = graph.adjacency(options.threshold)
     return DominationProblem(
         adjacency,
@@ -192,7 +170,7 @@ def _with_errors(problem: DominationProblem, graph: ReferenceGraph) -> Dominatio
     )
 
 
-def _costs(options: ReductionOptions, map: Map | None) -> np.ndarray | None:
+def _costs(options: DominatingSetOptions, map: Map | None) -> np.ndarray | None:
     if options.cost == "image":
         return None
     if map is None:
@@ -200,7 +178,7 @@ def _costs(options: ReductionOptions, map: Map | None) -> np.ndarray | None:
     return np.array([max(len(seen.rows), 1) for seen in map.observations.values()], np.float64)
 
 
-def _groups(adjacency: csr_array, options: ReductionOptions, map: Map | None) -> csr_array | None:
+def _groups(adjacency: csr_array, options: DominatingSetOptions, map: Map | None) -> csr_array | None:
     if not options.rim:
         return None
     if map is None:
@@ -209,10 +187,10 @@ def _groups(adjacency: csr_array, options: ReductionOptions, map: Map | None) ->
 
 
 def keep_random_images(map: Map, count: int, *, seed: int) -> Map:
-    """Keep this many images drawn at random, and the points they see: the paper's baseline.
+    """Keep this many images drawn at random, and the points they see: the baseline of the paper.
 
     Raises:
-        InputError: The map has fewer images, or not one is wanted.
+        InputError: The map has fewer images, or `count` is not positive.
     """
     names = list(map.images)
     if not 1 <= count <= len(names):

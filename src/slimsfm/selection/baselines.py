@@ -1,4 +1,4 @@
-"""K-cover [1]: every image uses at least K of the chosen points.
+"""Baselines: K-cover [1] and random points.
 
 References:
     [1] Li, Snavely and Huttenlocher, Location Recognition using Prioritized Feature Matching, ECCV 2010.
@@ -10,19 +10,19 @@ import numpy as np
 
 from slimsfm.arrays import Ids, Mask
 from slimsfm.selection.lazy import Gains, greedy_order
-from slimsfm.selection.problem import SelectionProblem, check_count, most_cover
+from slimsfm.selection.problem import SelectionProblem, check_point_count, most_cover
 
 
 def kcover(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:  # noqa: ARG001
-    """Choose points that every image can use many of.
+    """Choose points so that every image can use at least K of them.
 
-    Greedily the point that most of the images can use which have fewer than K yet [1], where K is capped at
-    the number of points that an image can use at all. [1] fixes K; here it is the largest at which `count`
-    points suffice, and what is left of the budget goes towards K + 1. Nothing is left to chance.
+    Greedily chooses the point that most images with fewer than K chosen points can use [1], where K is capped
+    at the number of points that an image can use at all. K is fixed in [1]; here it is the largest at which
+    `count` points suffice, and the remaining points are spent on K + 1. The choice is deterministic.
 
     Args:
-        problem: The points and who can use them.
-        count: How many points are wanted.
+        problem: The points and the images that can use them.
+        count: Number of points to choose.
         seed: Unused.
 
     Returns:
@@ -33,12 +33,12 @@ def kcover(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:  # n
 
     Notes:
         The greedy set for one K is at most 1 + ln(images of the most used point) times as large as the
-        smallest [2]. O(log K) rounds for one budget, each of O(uses + points) in all but unusual cases.
+        smallest [2]. There are O(log K) rounds, each of O(uses + points) in practice.
 
     References:
         [2] Wolsey, An analysis of the greedy algorithm for the submodular set covering problem, 1982.
     """
-    check_count(count)
+    check_point_count(count)
     low, high, cover = 0, most_cover(problem, count), KCover(problem)
     while low < high:
         middle = (low + high + 1) // 2
@@ -47,7 +47,7 @@ def kcover(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:  # n
             low, cover = middle, tried
         else:
             high = middle - 1
-    most = int(problem.points_an_image.max(initial=0))
+    most = int(problem.points_per_image.max(initial=0))
     while len(cover.chosen) < count and low < most:
         low += 1
         cover.extend(low, count)
@@ -55,19 +55,19 @@ def kcover(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:  # n
 
 
 class KCover:
-    """Points chosen until every image uses K of them, or of all that it can."""
+    """Chooses points until every image can use K of them, or all of its points."""
 
     def __init__(self, problem: SelectionProblem) -> None:
         self.chosen: list[int] = []
         self.free: Mask = np.ones(problem.num_points, bool)
-        """The points not chosen."""
+        """Whether each point is still free."""
         self._problem = problem
         self._seen = np.zeros(problem.num_images, np.int64)
         self._needed = np.zeros(problem.num_images, np.int64)
         self._gains = np.zeros(problem.num_points)
 
     def extend(self, cover: int, count: int) -> int:
-        """Choose until `count` points are chosen or all images are covered; gives the number chosen."""
+        """Choose until `count` points are chosen or all images are covered; returns the number chosen."""
         for point in self._order(cover):
             if len(self.chosen) >= count:
                 break
@@ -75,7 +75,7 @@ class KCover:
         return len(self.chosen)
 
     def choose(self, point: int) -> None:
-        """Add a point, whoever picked it."""
+        """Add a point to the chosen ones."""
         self.chosen.append(point)
         self.free[point] = False
         of = self._problem.images_of
@@ -86,7 +86,7 @@ class KCover:
             self._gains[self._problem.usable.indices[starts[image] : starts[image + 1]]] -= 1
 
     def _order(self, cover: int) -> Iterator[int]:
-        usable = self._problem.points_an_image
+        usable = self._problem.points_per_image
         self._needed = np.minimum(cover, usable)
         open_uses = np.repeat(self._seen < self._needed, usable)
         self._gains = np.bincount(
@@ -96,3 +96,22 @@ class KCover:
 
     def _now(self, points: Ids) -> Gains:
         return self._gains[points]
+
+
+def random_points(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:
+    """Draw points uniformly, without replacement, from those that any image can use.
+
+    Args:
+        problem: The points and the images that can use them.
+        count: Number of points to choose.
+        seed: Equal problems and seeds give equal points; a smaller count gives a prefix of them.
+
+    Returns:
+        Points in the order of the draw.
+
+    Raises:
+        ValueError: `count` is not positive.
+    """
+    check_point_count(count)
+    usable = np.flatnonzero(np.diff(problem.images_of.starts))
+    return np.random.default_rng(seed).permutation(usable)[:count]

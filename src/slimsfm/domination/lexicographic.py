@@ -1,4 +1,4 @@
-"""How solvers of integer programs find best sets: aim by aim, component by component."""
+"""Lexicographic minimization by integer programs: one objective after the other, per component."""
 
 from dataclasses import dataclass
 from time import perf_counter
@@ -7,18 +7,24 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from slimsfm.domination.cover import Cover, components, cover_of, split
-from slimsfm.domination.greedy import LARGE, greedy, greedy_parts, part_bound
-from slimsfm.domination.presolve import reduced
+from slimsfm.domination.cover import Cover, components, cover_of, presolve, split
+from slimsfm.domination.greedy_cover import LARGE, greedy, greedy_parts, part_bound
+from slimsfm.domination.milp import (
+    Minimizer,
+    Minimum,
+    Program,
+    StagedProgram,
+    covering_program,
+    error_program,
+    staged_program,
+)
 from slimsfm.domination.problem import DominationProblem
-from slimsfm.domination.program import Minimizer, Minimum, Program, covering_program
 from slimsfm.domination.solution import Bounds, Solution, merit, rounded_up, solution_of
-from slimsfm.domination.staged import StagedProgram, error_program, staged_program
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Search:
-    """A problem, who minimizes its programs, and until when."""
+    """A problem, the minimizer of its programs, and a deadline."""
 
     problem: DominationProblem
     minimize: Minimizer
@@ -27,14 +33,14 @@ class _Search:
     effort: int
 
     def minimum(self, program: Program, hint: np.ndarray) -> Minimum:
-        """The minimum, or what is known of it when the time is up."""
+        """The minimum, or the best result when the time is up."""
         seconds = self.deadline - perf_counter()
         if seconds <= 0:
             return Minimum(values=None, bound=-np.inf)
         return self.minimize(program, hint, seconds)
 
     def relaxation(self, program: Program) -> int | float:
-        """The least objective over the reals: a bound that the search over 0 and 1 may be slow to find."""
+        """The least objective over the reals: a bound that the search over integers may find slowly."""
         result = linprog(
             program.objective,
             A_ub=-program.matrix.tocsc(),
@@ -46,7 +52,7 @@ class _Search:
         return float(result.fun) if result.status == 0 else 0.0
 
     def best(self, *sets: tuple[int, ...]) -> tuple[int, ...]:
-        """The best of some sets, of which one or more keep to the problem; the first of equal ones."""
+        """The best feasible one of some sets; the first among equals."""
         kept = [chosen for chosen in dict.fromkeys(sets) if self.problem.satisfies(chosen)]
         return min(kept, key=lambda chosen: merit(self.problem, chosen))
 
@@ -54,9 +60,9 @@ class _Search:
 def solve_in_stages(
     problem: DominationProblem, minimize: Minimizer, *, time_limit_s: float, seed: int, effort: int = 1
 ) -> Solution:
-    """Minimize what is left unmet, then the cost, then the error, each with the earlier ones held.
+    """Minimize the number unmet, then the cost, then the error, each with the earlier ones fixed.
 
-    Starts from `greedy`'s choices and never ends with a worse one. Without a budget there is nothing to leave
+    The search starts from the choices of `greedy` and never returns a worse one. Without a budget nothing is
     unmet, and costs are minimized on the reduced problem, component by component.
 
     Raises:
@@ -79,10 +85,10 @@ def solve_in_stages(
 
 def _cheapest(search: _Search) -> tuple[tuple[int, ...], Bounds]:
     problem = search.problem
-    kernel = reduced(cover_of(problem))
-    picked = [*problem.forced_in, *kernel.chosen]
+    presolved = presolve(cover_of(problem))
+    picked = list(presolved.chosen)
     bound = problem.cost(picked)
-    pieces = sorted(split(kernel.cover), key=lambda piece: piece.matrix.nnz)
+    pieces = sorted(split(presolved.cover), key=lambda piece: piece.matrix.nnz)
     hints = greedy_parts(pieces, seed=search.seed, effort=search.effort)
     for piece, hint in zip(pieces, hints, strict=True):
         part, least = _cheapest_part(search, piece, hint)
@@ -119,16 +125,16 @@ def _most_met(search: _Search) -> tuple[tuple[int, ...], Bounds]:
     chosen, least = _improved(search, staged, staged.program.aiming_at(staged.unmet), known)
     unmet_bound = max(0, rounded_up(least + len(staged.rows)))
     if problem.num_unmet(chosen) > unmet_bound:
-        return chosen, Bounds(unmet=unmet_bound, cost=problem.cost(problem.forced_in))
+        return chosen, Bounds(unmet=unmet_bound)
     held = staged.program.aiming_at(staged.unmet).holding(unmet_bound - len(staged.rows))
     chosen, least = _improved(search, staged, held.aiming_at(staged.cost), chosen)
-    return chosen, Bounds(unmet=unmet_bound, cost=max(least, problem.cost(problem.forced_in)))
+    return chosen, Bounds(unmet=unmet_bound, cost=max(least, 0))
 
 
 def _least_error(
     search: _Search, errors: csr_array, chosen: tuple[int, ...]
 ) -> tuple[tuple[int, ...], int | float]:
-    """The set of least total error found among those of equal cost that meet as much, and a bound on it."""
+    """The set of least total error among sets of equal cost that meet equally much, and a bound."""
     problem = search.problem
     rows = np.arange(len(problem.requirements[1]))
     parts = components(problem.requirements[0]) if problem.budget is None else [rows]
@@ -143,7 +149,7 @@ def _least_error(
 
 
 def _held(problem: DominationProblem, staged: StagedProgram, chosen: tuple[int, ...]) -> Program:
-    """The staged program with number met and cost held at those of a set."""
+    """The staged program with the number met and the cost of a set as constraints."""
     cost = float(staged.cost[: len(staged.nodes)] @ np.isin(staged.nodes, chosen))
     program = staged.program.aiming_at(staged.cost).holding(cost)
     if problem.budget is None:
@@ -155,7 +161,7 @@ def _held(problem: DominationProblem, staged: StagedProgram, chosen: tuple[int, 
 def _improved(
     search: _Search, staged: StagedProgram, program: Program, chosen: tuple[int, ...]
 ) -> tuple[tuple[int, ...], int | float]:
-    """A set, or a better one with the part's nodes as a program's minimum has them; and its bound."""
+    """A set, or a better one with the part's nodes from the minimum of a program; and the bound."""
     hint = np.isin(staged.nodes, chosen)
     found = search.minimum(program, hint)
     if found.values is None:

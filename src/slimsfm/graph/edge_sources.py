@@ -1,0 +1,210 @@
+"""The edge sources: stored matches, common points, localizing again, and a mix of these.
+
+References:
+    [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set, 2025.
+"""
+
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import Int64
+
+from slimsfm.arrays import Ids, Points2D
+from slimsfm.features import unit_rows
+from slimsfm.geometry import corner_error
+from slimsfm.graph.candidates import all_pairs, covisible_pairs, likely_pairs
+from slimsfm.graph.options import GraphOptions, PairErrors, PairIndices
+from slimsfm.localization.matching import matching_with
+from slimsfm.localization.strategy import MatchingOptions, Query
+from slimsfm.mapping.map import Map
+from slimsfm.pose import RansacOptions, estimate_pose
+
+_CACHED_IMAGES = 256
+_CACHED_QUERIES = 64  # 2 MB each with 4096 descriptors of 128 numbers
+_MOST_MATCHES = 100  # per pose: stored matches are verified, so more of them hardly change it
+_NEAR = 2.0  # an error within this factor of the threshold may fall on either side of it
+_MIN_COMMON_POINTS = 20  # a pair without stored matches is worth matching from here
+
+
+class ReferenceImages:
+    """The reference images of a map by index, and the step that all sources share: pose and error."""
+
+    def __init__(self, map: Map, ransac: RansacOptions) -> None:
+        self.map = map
+        self.names = tuple(map.images)
+        self._ransac = ransac
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Index of each name."""
+        return {name: index for index, name in enumerate(self.names)}
+
+    def points_of(self, index: int) -> Int64[np.ndarray, " n"]:
+        """For each keypoint of an image the row of the point that it observes, or -1."""
+        name = self.names[index]
+        points = np.full(self.map.images[name].num_points2D(), -1, np.int64)
+        seen = self.map.observations[name]
+        points[seen.rows] = seen.points
+        return points
+
+    def error(self, index: int, points2D: Points2D, points: Ids) -> float:
+        """Relative corner error of an image's pose, estimated from pixels and the rows of their points."""
+        name = self.names[index]
+        pose = estimate_pose(
+            points2D, self.map.points3D_in_world[points], self.map.camera(name), self._ransac
+        )
+        if pose is None:
+            return np.inf
+        return corner_error(pose.cam_from_world, self.map.images[name].cam_from_world(), self.map.box)
+
+
+class MatchEdges:
+    """Localizes images from each other by the verified matches in the map.
+
+    A match between a keypoint of u that observes a point and a keypoint of v is a 2D-3D match of v. Each pair
+    is read once for both directions. A pair without stored matches has no edge. Cost: one pose per direction,
+    no matching.
+    """
+
+    def __init__(self, map: Map, options: GraphOptions) -> None:
+        self._references = ReferenceImages(map, options.ransac)
+        self._points = lru_cache(_CACHED_IMAGES)(self._references.points_of)
+
+    def pairs(self) -> PairIndices:
+        """Return the pairs that have stored matches."""
+        index = self._references.index
+        found = [(index[a], index[b]) for a, b in self._references.map.matches if a in index and b in index]
+        pairs = np.array(found, np.int64).reshape(-1, 2)
+        return np.unique(np.sort(pairs, axis=1), axis=0)
+
+    def errors(self, u: int, v: int) -> PairErrors:
+        """Localize u and v from each other."""
+        rows_u, rows_v = self._matches(u, v).T
+        return PairErrors(
+            v_from_u=self._error(u, rows_u, v, rows_v), u_from_v=self._error(v, rows_v, u, rows_u)
+        )
+
+    def _error(self, reference: int, reference_rows: np.ndarray, query: int, query_rows: np.ndarray) -> float:
+        points = self._points(reference)[reference_rows]
+        sees = np.flatnonzero(points >= 0)
+        used = sees[:: max(1, -(-len(sees) // _MOST_MATCHES))]
+        return self._references.error(query, self._pixels(query, query_rows[used]), points[used])
+
+    def _matches(self, u: int, v: int) -> Int64[np.ndarray, "n 2"]:
+        matches, names = self._references.map.matches, self._references.names
+        if (names[u], names[v]) in matches:
+            return matches[names[u], names[v]]
+        return matches[names[v], names[u]][:, ::-1]
+
+    def _pixels(self, index: int, rows: Ids) -> Points2D:
+        points2D = self._references.map.images[self._references.names[index]].points2D
+        return np.array([points2D[row].xy for row in rows.tolist()], np.float64).reshape(-1, 2)
+
+
+class TrackEdges:
+    """Localizes images from each other by the points that both see, for maps without matches.
+
+    A point that u and v both see is a 2D-3D match in either direction. A track joins more keypoints than any
+    single pair of images matches, so this source finds too many edges rather than too few.
+    """
+
+    def __init__(self, map: Map, options: GraphOptions) -> None:
+        self._references = ReferenceImages(map, options.ransac)
+        self._min_points = options.ransac.min_inliers
+        self._seen = lru_cache(_CACHED_IMAGES)(self._seen_by)
+
+    def pairs(self) -> PairIndices:
+        """Return the pairs that see enough common points for a pose."""
+        return covisible_pairs(self._references.map, self._min_points)
+
+    def errors(self, u: int, v: int) -> PairErrors:
+        """Localize u and v from each other."""
+        points_u, pixels_u = self._seen(u)
+        points_v, pixels_v = self._seen(v)
+        common, rows_u, rows_v = np.intersect1d(points_u, points_v, return_indices=True)
+        return PairErrors(
+            v_from_u=self._references.error(v, pixels_v[rows_v], common),
+            u_from_v=self._references.error(u, pixels_u[rows_u], common),
+        )
+
+    def _seen_by(self, index: int) -> tuple[Ids, Points2D]:
+        name = self._references.names[index]
+        points2D, seen = self._references.map.images[name].points2D, self._references.map.observations[name]
+        pixels = np.array([points2D[row].xy for row in seen.rows], np.float64).reshape(-1, 2)
+        return seen.points, pixels
+
+
+class LocalizeEdges:
+    """Localizes images from each other by matching them again: Algorithm 1 of the paper [1].
+
+    To localize v from u, the keypoints of v are matched against the points that u sees, each described as in
+    u. Complexity: two matchings per pair, each of all keypoints of one image with the points of the other.
+    """
+
+    def __init__(self, map: Map, options: GraphOptions) -> None:
+        self._references = ReferenceImages(map, options.ransac)
+        self._options = options
+        self._matching = matching_with(map, MatchingOptions(matcher=options.matcher), _CACHED_QUERIES)
+        self._query = lru_cache(_CACHED_QUERIES)(self._read)
+
+    def pairs(self) -> PairIndices:
+        """Return the likely pairs, or all pairs."""
+        choose = all_pairs if self._options.candidates == "all" else likely_pairs
+        return choose(self._references.map)
+
+    def errors(self, u: int, v: int) -> PairErrors:
+        """Localize u and v from each other."""
+        return PairErrors(v_from_u=self.error(u, v), u_from_v=self.error(v, u))
+
+    def error(self, reference: int, query: int) -> float:
+        """Relative corner error of the query's pose, estimated from the reference alone."""
+        seen = self._query(query)
+        matches = self._matching.match(seen, reference, None)
+        return self._references.error(query, matches.pixels(seen), matches.points)
+
+    def _read(self, index: int) -> Query:
+        map_, name = self._references.map, self._references.names[index]
+        features = map_.features[name]
+        return Query(
+            keypoints=features.keypoints.astype(np.float64),
+            descriptors=unit_rows(features.descriptors),
+            features=features,
+            camera=map_.camera(name),
+            image=map_.photos.get(name),
+        )
+
+
+class HybridEdges:
+    """Uses stored matches, and localizes only where they do not decide.
+
+    Stored matches do not decide where a pair has no matches although its images see enough common points,
+    where fewer matches become 2D-3D matches than a pose needs, where they give no pose, and where an error is
+    near the threshold.
+    """
+
+    def __init__(self, map: Map, options: GraphOptions) -> None:
+        self._map = map
+        self._options = options
+        self._matches = MatchEdges(map, options)
+        self._localize = LocalizeEdges(map, options)
+        self._matched = {(int(u), int(v)) for u, v in self._matches.pairs()}
+
+    def pairs(self) -> PairIndices:
+        """Return the pairs that have stored matches or see enough common points."""
+        covisible = covisible_pairs(self._map, _MIN_COMMON_POINTS)
+        return np.unique(np.concatenate([self._matches.pairs(), covisible]), axis=0)
+
+    def errors(self, u: int, v: int) -> PairErrors:
+        """Localize u and v from each other."""
+        if (min(u, v), max(u, v)) not in self._matched:
+            return self._localize.errors(u, v)
+        found = self._matches.errors(u, v)
+        v_from_u, u_from_v = found.v_from_u, found.u_from_v
+        return PairErrors(
+            v_from_u=v_from_u if self._is_decided(v_from_u) else self._localize.error(u, v),
+            u_from_v=u_from_v if self._is_decided(u_from_v) else self._localize.error(v, u),
+        )
+
+    def _is_decided(self, error: float) -> bool:
+        threshold = self._options.threshold
+        return error < threshold / _NEAR or threshold * _NEAR < error < np.inf
