@@ -8,14 +8,6 @@ import pycolmap
 import pytest
 from matplotlib.colors import to_hex
 from scipy.stats import binomtest
-
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.protocol import Query
-from slimsfm.evaluation.scores import Scores
-from slimsfm.evaluation.statistics import Interval
-from slimsfm.evaluation.table import Row
-from slimsfm.geometry import Box
-from slimsfm.localization import Seconds
 from slimsfm.report.charts import (
     QueryPlace,
     ReferencePlace,
@@ -36,6 +28,14 @@ from slimsfm.report.charts.directions import (
     verdicts,
 )
 from slimsfm.report.charts.frontier import pareto
+
+from slimsfm.evaluation.outcomes import Outcomes
+from slimsfm.evaluation.protocol import Query
+from slimsfm.evaluation.scores import Scores
+from slimsfm.evaluation.statistics import Interval
+from slimsfm.evaluation.table import Row
+from slimsfm.geometry import Box
+from slimsfm.localization import Seconds
 from slimsfm.report.figures import CHOSEN, figure_svg
 from slimsfm.synthetic.trajectory import look_at
 

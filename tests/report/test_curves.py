@@ -4,9 +4,9 @@ from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
+from slimsfm.report.curves import curves_figure
 
 from candidates import FULL, candidate, frontier_of
-from slimsfm.report.curves import curves_figure
 from slimsfm.report.figures import figure_svg
 
 DIRECT = "direct: kcover"

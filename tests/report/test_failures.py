@@ -1,10 +1,10 @@
 from dataclasses import replace
 
 import numpy as np
+from slimsfm.report.queries import worth_seeing
 
 from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.report.failures import changes, failures_html
-from slimsfm.report.queries import worth_seeing
 from slimsfm.report.report_data import story_of
 
 

@@ -10,14 +10,14 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.patches import FancyArrowPatch, Rectangle
 from PIL import Image
+from slimsfm.report.charts import before_after_figure, cloud_figure, graph_figure
+from slimsfm.report.graph_layout import graph_layout, node_side
 
 import slimsfm.report
 from scenes import graph_from_dense
 from slimsfm.errors import OutputError
 from slimsfm.geometry import BOX_EDGES
-from slimsfm.report.charts import before_after_figure, cloud_figure, graph_figure
 from slimsfm.report.figures import CHOSEN, FORMATS, INK, PAPER, figure_svg, new_figure, save_figure, styled
-from slimsfm.report.graph_layout import graph_layout, node_side
 
 SVG = "{http://www.w3.org/2000/svg}"
 HEADS = {".svg": b"<?xml", ".png": b"\x89PNG", ".pdf": b"%PDF"}

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from slimsfm.report.query_video import DrawnQuery, drawn_queries, film_frame
 
 from commands import Outcome, contents, slimsfm
 from slimsfm.evaluation.result_files import read_run
-from slimsfm.report.query_video import DrawnQuery, drawn_queries, film_frame
 
 SHARED = ("frontier", "reliability-sift")
 OF_METHOD = ("before-after", "graph", "sphere", "reliability")

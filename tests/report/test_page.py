@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from slimsfm.report.budget import budget_for
+from slimsfm.report.jpegs import photo_uri
 
 from slimsfm.errors import MapError, OutputError
 from slimsfm.report import report_html, write_report
-from slimsfm.report.budget import budget_for
-from slimsfm.report.jpegs import photo_uri
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 BYTES_PER_POINT = 20  # three floats and three bytes, as text

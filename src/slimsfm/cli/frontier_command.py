@@ -17,8 +17,8 @@ from slimsfm.mapping.io import bytes_by_part, read_map, weigh_map
 from slimsfm.mapping.map import check_has_features
 from slimsfm.progress import shown
 from slimsfm.reduction import USES, FrontierOptions, frontier, recommend
-from slimsfm.report.curves import curves_figure
 from slimsfm.report.figures import check_figure, save_figure
+from slimsfm.report.tradeoffs import curves_figure
 
 
 def frontier_of(

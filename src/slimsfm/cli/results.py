@@ -23,7 +23,7 @@ from slimsfm.evaluation.results import Run
 from slimsfm.evaluation.summary import summarize_domination
 from slimsfm.evaluation.table import BY_FRAME, Row
 from slimsfm.files import replacing
-from slimsfm.report.formatting import ratio
+from slimsfm.report.formatting import format_ratio
 
 
 def report_run(run: Run) -> None:
@@ -82,7 +82,10 @@ def print_rows(rows: Sequence[Row]) -> None:
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     """Say, line by line, what one map gains and what it costs against another."""
     for one in comparisons:
-        faster, smaller = ratio(one.faster, "faster", "slower"), ratio(one.smaller, "smaller", "larger")
+        faster, smaller = (
+            format_ratio(one.faster, "faster", "slower"),
+            format_ratio(one.smaller, "smaller", "larger"),
+        )
         console.print(
             f"{one.object}, {', '.join(one.after)}: {faster} in matching and pose "
             f"({one.faster_between.low:.1f} to {one.faster_between.high:.1f}) than {', '.join(one.before)}, "
