@@ -32,7 +32,7 @@ def view(
         reduced: A map that was reduced from it, to switch between the two.
         images: Folder of the map's photos, to show them in their cameras.
         queries: Folder of images to localize.
-        camera: Intrinsics of the queries in COLMAP's cameras.txt format; default: those of the map or of EXIF.
+        camera: Intrinsics of the queries in COLMAP's cameras.txt format; default: the map's or EXIF's.
         focal: How well the queries' focal length is known.
         networks: Where learned methods run.
         port: Port of the view; 0 picks a free one.
@@ -54,7 +54,7 @@ def view(
         MapWithSize(map=read_map(path), num_bytes=bytes_by_part(path)["total"]) for path in paths
     ]
     try:
-        with live_view(full, *others, queries=asked, host=host, port=port) as live:
+        with live_view(*maps, queries=asked, host=host, port=port) as live:
             names = " and ".join(str(path) for path in paths)
             console.print(f"{live.address} shows {names}; Ctrl-C stops it")
             if images and (missing := live.show_photos(images, shown)):

@@ -87,7 +87,7 @@ def query_changes(result: ObjectResult, comparison: Comparison) -> list[QueryCha
 
     Of several random draws of a map the first one counts.
     """
-    before, after = compared_outcomes(result, comparison)
+    before, after = _compared(result, comparison)
     each = [
         QueryChange(
             object=result.name,
@@ -101,7 +101,7 @@ def query_changes(result: ObjectResult, comparison: Comparison) -> list[QueryCha
     return [one for one in each if one.verdict]
 
 
-def compared_outcomes(result: ObjectResult, comparison: Comparison) -> tuple[Outcomes, Outcomes]:
+def _compared(result: ObjectResult, comparison: Comparison) -> tuple[Outcomes, Outcomes]:
     """Outcomes of an object's queries before and after, in the first draw of each map."""
     before, after = (
         cell.trials[0].outcomes
@@ -193,7 +193,7 @@ def worst_and_others(errors: Float64[np.ndarray, " n"], count: int) -> list[int]
 
 def queries_html(result: ObjectResult, comparison: Comparison, budget: ReportBudget) -> str:
     """Some queries with the object's box at the pose that the reduced map gives."""
-    before, after = compared_outcomes(result, comparison)
+    before, after = _compared(result, comparison)
     shown = worst_and_others(after.error, budget.frames)
     frames = list(_frames(result, before, after, shown))
     if not frames:

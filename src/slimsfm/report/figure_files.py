@@ -145,14 +145,23 @@ def _write_method(writer: _Writer, maps: RunMaps) -> None:
     thumbnails = {name: shrink(photo, _THUMBNAIL_PX) for name, photo in photos.items() if photo is not None}
     drawing = GraphDrawing(graph=maps.graph, threshold=maps.threshold, chosen=mapped.dominating_set)
     writer.save(graph_figure(drawing, thumbnails), place, "graph")
-    before, after = (cell.trials[0].outcomes for cell in _compared(result, mapped.method))
-    references = {name: image.cam_from_world() for name, image in full.images.items()}
+    for kind, figure in method_charts(maps).items():
+        writer.save(figure, place, kind)
+    after = _compared(result, mapped.method)[1].trials[0].outcomes
+    _write_queries(writer, result, after, place)
+
+
+def method_charts(maps: RunMaps) -> dict[str, Figure]:
+    """Charts that compare the full map with the dominating set, by kind."""
+    result, chosen = maps.result, maps.mapped.dominating_set
+    before, after = (cell.trials[0].outcomes for cell in _compared(result, maps.mapped.method))
+    references = {name: image.cam_from_world() for name, image in maps.maps["full"].images.items()}
     queries = [query.cam_from_world for query in result.queries]
     verdicts = query_verdicts(before), query_verdicts(after)
-    sphere = sphere_chart(result.box, references, mapped.dominating_set, queries, verdicts)
-    writer.save(sphere, place, "sphere")
-    writer.save(reliability_chart(after), place, "reliability")
-    _write_queries(writer, result, after, place)
+    return {
+        "sphere": sphere_chart(result.box, references, chosen, queries, verdicts),
+        "reliability": reliability_chart(after),
+    }
 
 
 def _cells(result: ObjectResult, method: str) -> list[Cell]:

@@ -209,11 +209,11 @@ class LiveView:
         assert self.queries is not None
         with self.busy:
             options = LocalizationOptions(focal=self.queries.focal)
-            map, path = self.maps[shown].map, self.queries.folder / name
+            map_, path = self.maps[shown].map, self.queries.folder / name
             image = self.queries.read(name)
-            camera = query_camera(map, path, self.queries.camera, options.focal)
+            camera = query_camera(map_, path, self.queries.camera, options.focal)
             if shown not in self._localizers:
-                self._localizers[shown] = Localizer(map, options)
+                self._localizers[shown] = Localizer(map_, options)
             return image, self._localizers[shown].localize(image, camera)
 
     def _connect(self, client: viser.ClientHandle) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 from slimsfm.evaluation.results import Run
 from slimsfm.files import replacing
 from slimsfm.mapping.map import Map
-from slimsfm.report.failures import compared_outcomes, queries_html
+from slimsfm.report.failures import queries_html
+from slimsfm.report.figure_files import method_charts
 from slimsfm.report.formatting import (
     format_dominating_set,
     format_gain,
@@ -20,7 +21,6 @@ from slimsfm.report.formatting import (
 )
 from slimsfm.report.graph_view import GraphDrawing, graph_html
 from slimsfm.report.overview import charts_html, overview_html
-from slimsfm.report.reliability import reliability_chart
 from slimsfm.report.report_data import (
     ReportBudget,
     ReportData,
@@ -30,7 +30,6 @@ from slimsfm.report.report_data import (
     report_budget,
 )
 from slimsfm.report.scene3d import scene_json
-from slimsfm.report.sphere import query_verdicts, sphere_chart
 from slimsfm.report.tradeoffs import frontier_chart
 
 # the browser fetches nothing, whatever text the page contains
@@ -116,6 +115,7 @@ def _section(maps: RunMaps, data: ReportData, anchor: str, *, is_open: bool) -> 
         f"{format_line(one.after, data.methods).capitalize()}: {format_gain(one)}." for one in lines
     )
     method = f"Maps and graph are from {escape(maps.mapped.method)}. " if len(data.methods) > 1 else ""
+    charts = method_charts(maps).values() if lines else ()
     drawing = GraphDrawing(graph=maps.graph, threshold=maps.threshold, chosen=maps.mapped.dominating_set)
     return f"""<details class="card object" id="{anchor}"{" open" * is_open}>
 <summary><h2>{escape(result.name)}</h2><p class="headline">{escape(said)}</p></summary>
@@ -129,7 +129,7 @@ def _section(maps: RunMaps, data: ReportData, anchor: str, *, is_open: bool) -> 
 of the object's box. Lines of the headline have a red background. Click on a header to sort.</p>
 {queries_html(result, lines[0], budget) if lines else ""}
 <h3>Charts</h3>
-{_charts(maps, data)}
+{charts_html([frontier_chart(data.rows[result.name]), *charts])}
 </details>"""
 
 
@@ -152,22 +152,6 @@ def _buttons(maps: Mapping[str, Map]) -> str:
         f"<b>{escape(_TITLES.get(variant, variant))}</b> {format_map(one)}</button>"
         for variant, one in maps.items()
     )
-
-
-def _charts(maps: RunMaps, data: ReportData) -> str:
-    result, lines = maps.result, data.headlines(maps.result.name)
-    charts = [frontier_chart(data.rows[result.name])]
-    if lines:
-        before, after = compared_outcomes(result, lines[0])
-        full = maps.maps["full"]
-        references = {name: image.cam_from_world() for name, image in full.images.items()}
-        kept = list(maps.maps.get("dominating", full).images)
-        queries = [query.cam_from_world for query in result.queries]
-        verdicts = query_verdicts(before), query_verdicts(after)
-        charts.append(sphere_chart(result.box, references, kept, queries, verdicts))
-        cell = result.cell(*lines[0].after)
-        charts += [reliability_chart(cell.outcomes)] if cell else []
-    return charts_html(charts)
 
 
 def _measurement_html(run: Run) -> str:
