@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from slimsfm.report.query_video import DrawnQuery, drawn_queries, film_frame
 
 from commands import Outcome, contents, slimsfm
 from slimsfm.evaluation.result_files import read_run
+from slimsfm.report.figure_files import DrawnQuery, draw_queries, query_video_frame
 
 SHARED = ("frontier", "reliability-sift")
 OF_METHOD = ("before-after", "graph", "sphere", "reliability")
@@ -90,7 +90,7 @@ def test_the_index_names_each_file_and_says_what_it_shows(drawn):
     written = {str(output / name) for name in files(output) if "/queries/" not in name}
     written |= {str(output / name / "sift" / "queries") for name in ("can", "mug")}
     assert set(listed) == written
-    assert "accuracy over size and time" in out
+    assert "accuracy over map size and query time" in out
 
 
 def test_queries_are_drawn_with_both_boxes_and_filmed(run, drawn):
@@ -111,7 +111,7 @@ def test_queries_of_equal_names_are_numbered_and_those_without_a_photo_left_out(
     queries = tuple(replace(one, path=path) for one, path in zip(result.queries, paths, strict=True))
     photo = np.zeros((480, 640, 3), np.uint8)
     outcomes = result.cells[0].trials[0].outcomes
-    named = drawn_queries(
+    named = draw_queries(
         replace(result, queries=queries), outcomes, lambda path: None if path == paths[1] else photo
     )
     assert [(one.name, one.caption[:3]) for one in named] == [("0000-1", "1/3"), ("0002-1", "3/3")]
@@ -120,12 +120,12 @@ def test_queries_of_equal_names_are_numbered_and_those_without_a_photo_left_out(
 def test_every_frame_of_a_film_has_its_size_and_tells_the_error():
     white = np.full((40, 20, 3), 255, np.uint8)
     for caption, is_longer in (("", False), ("1/2  0.3 % of d", True)):
-        frame = film_frame(DrawnQuery(name="a", image=white, caption=caption), 120, 200)
+        frame = query_video_frame(DrawnQuery(name="a", image=white, caption=caption), 120, 200)
         assert frame.shape == (120, 200, 3)
         assert (frame[40:80, 90:110] == 255).all()
         assert (frame[:100, :90] == 0).all()
         assert (frame[100:, :90] > 128).any() == is_longer
-    large = film_frame(DrawnQuery(name="a", image=np.tile(white, (10, 10, 1)), caption=""), 120, 200)
+    large = query_video_frame(DrawnQuery(name="a", image=np.tile(white, (10, 10, 1)), caption=""), 120, 200)
     assert (large[:100, 70:130] == 255).all()
     assert (large[:, :70] == 0).all()
 

@@ -50,9 +50,7 @@ def view(
     given = read_camera(camera) if camera else None
     asked = LiveQueries(folder=queries, camera=given, focal=focal) if queries else None
     paths = [map, reduced] if reduced else [map]
-    full, *others = [
-        MapWithSize(map=read_map(path), num_bytes=bytes_by_part(path)["total"]) for path in paths
-    ]
+    maps = [MapWithSize(map=read_map(path), num_bytes=bytes_by_part(path)["total"]) for path in paths]
     try:
         with live_view(*maps, queries=asked, host=host, port=port) as live:
             names = " and ".join(str(path) for path in paths)

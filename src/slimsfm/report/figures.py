@@ -36,13 +36,13 @@ CHOSEN = "#d6231f"
 DROPPED = "#8a8d96"
 """Color of images that are dropped."""
 
-BOX = "#2268d8"
+BOX_COLOR = "#2268d8"
 """Color of the object's box."""
 
-RIGHT = "#12873a"
+RIGHT_COLOR = "#12873a"
 """Color of queries that are localized correctly."""
 
-FORMATS = (".svg", ".png", ".pdf")
+FIGURE_FORMATS = (".svg", ".png", ".pdf")
 """Suffixes of the supported file formats."""
 
 _STYLE: dict[Any, Any] = {
@@ -170,8 +170,8 @@ def check_figure(path: Path) -> None:
     Raises:
         OutputError: The suffix is not a supported format.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise OutputError(f"{path}: not a supported figure format ({', '.join(FORMATS)})")
+    if path.suffix.lower() not in FIGURE_FORMATS:
+        raise OutputError(f"{path}: not a supported figure format ({', '.join(FIGURE_FORMATS)})")
 
 
 def save_figure(figure: Figure, path: Path, *, overwrite: bool = False) -> None:

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from slimsfm.arrays import Points2D, Points3D
 from slimsfm.geometry import BOX_EDGES, Box
 from slimsfm.mapping.map import Map
-from slimsfm.report.figures import BOX, CHOSEN, DROPPED, new_figure, styled
+from slimsfm.report.figures import BOX_COLOR, CHOSEN, DROPPED, new_figure, styled
 from slimsfm.report.formatting import format_map
 
 MAX_POINTS = 15_000
@@ -197,7 +197,7 @@ def before_after_figure(full: Map, reduced: Map) -> Figure:
         panels = figure.subplots(1, 2)
         for axes, shown, name in zip(panels, (full, reduced), ("Before", "After"), strict=True):
             _draw_points(axes, scene_points(shown, scene.frame, MAX_POINTS), distance)
-            _draw_lines(axes, [scene.box], BOX_EDGES, distance, BOX, 1.1, "box")
+            _draw_lines(axes, [scene.box], BOX_EDGES, distance, BOX_COLOR, 1.1, "box")
             chosen = [scene.frusta[key] for key in shown.images if key in reduced.images]
             dropped = [scene.frusta[key] for key in shown.images if key not in reduced.images]
             _draw_lines(axes, dropped, _FRUSTUM_EDGES, distance, DROPPED, 0.5, "dropped")

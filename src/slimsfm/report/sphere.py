@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.evaluation.outcomes import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS, Box
-from slimsfm.report.figures import CHOSEN, DROPPED, INK, RIGHT, new_figure, styled
+from slimsfm.report.figures import CHOSEN, DROPPED, INK, RIGHT_COLOR, new_figure, styled
 from slimsfm.report.formatting import plural
 from slimsfm.report.scene3d import view_frame
 
@@ -22,7 +22,7 @@ Verdict = Literal["right", "wrong", "not localized"]
 """Outcome of a query; right: error below a tenth of the diagonal."""
 
 _LOOKS: dict[Verdict, dict] = {
-    "right": {"marker": "o", "ms": 4.5, "color": RIGHT, "mec": "none"},
+    "right": {"marker": "o", "ms": 4.5, "color": RIGHT_COLOR, "mec": "none"},
     "wrong": {"marker": "x", "ms": 7, "color": INK, "mew": 2},
     "not localized": {"marker": "o", "ms": 7, "mfc": "none", "mec": INK, "mew": 1.5},
 }

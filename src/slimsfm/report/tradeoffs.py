@@ -132,7 +132,7 @@ def _chart(
     headings: tuple[str, str, str],
     *,
     highest: float,
-    full_bytes: float | None = None,
+    full_bytes: int | None = None,
 ) -> Figure:
     with styled():
         figure = new_figure(9.6, 4.2, "Accuracy over map size and over query time")
