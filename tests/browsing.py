@@ -70,7 +70,8 @@ class Browser:
 
     def click(self, node):
         ray = {"ray_origin": (0, 0, 0), "ray_direction": (0, 0, 1), "screen_pos": (0.5, 0.5)}
-        self._send("SceneNodeClick", name=node.name, instance_index=None, modifier=None, owner="", **ray)
+        owner = str(self.viewer.client.client_id)
+        self._send("SceneNodeClick", name=node.name, instance_index=None, modifier=None, owner=owner, **ray)
 
     def press(self, button):
         self.set(button, True)

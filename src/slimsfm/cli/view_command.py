@@ -61,7 +61,7 @@ def view(
             while True:
                 sleep(3600)
     except KeyboardInterrupt:
-        console.print("stopped")
+        print("stopped")  # rich would repeat a line whose printing was interrupted
 
 
 def main(arguments: Sequence[str]) -> None:

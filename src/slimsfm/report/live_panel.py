@@ -71,6 +71,7 @@ class ViewerPanel:
         self.box = client.scene.add_line_segments(
             "/box", corners, BOX_RGB, thickness=_LINE_PX, thickness_units="screen"
         )
+        self.descriptions: dict[str, viser.GuiMarkdownHandle] = {}
         self.switch = self._add_switch()
         self.point_size = client.gui.add_slider("Point size", 0.2, 5.0, 0.1, 1.0)
         self.point_size.on_update(lambda _: self._resize_points())
@@ -168,17 +169,14 @@ class ViewerPanel:
             points.point_size = _POINT_SIZE * self.point_size.value
 
     def _add_switch(self) -> dict[str, viser.GuiButtonHandle]:
-        maps = self._view.maps
-        texts = {key: f"{format_map(one.map)}, {size(one.num_bytes)}" for key, one in maps.items()}
-        if len(texts) == 1:
-            self.client.gui.add_markdown(texts[BEFORE])
-            return {}
         buttons = {}
-        for key, text in texts.items():
-            color = _SHOWN_COLOR if key == self.shown else _OTHER_COLOR
-            buttons[key] = self.client.gui.add_button(key, color=color)
-            buttons[key].on_click(lambda _, key=key: self.show(key))
-            self.client.gui.add_markdown(text)
+        for key, one in self._view.maps.items():
+            if len(self._view.maps) > 1:
+                color = _SHOWN_COLOR if key == self.shown else _OTHER_COLOR
+                buttons[key] = self.client.gui.add_button(key, color=color)
+                buttons[key].on_click(lambda _, key=key: self.show(key))
+            text = f"{format_map(one.map)}, {size(one.num_bytes)}"
+            self.descriptions[key] = self.client.gui.add_markdown(text)
         return buttons
 
     def _add_image(self, name: str, *, kept: bool) -> viser.CameraFrustumHandle:
