@@ -1,4 +1,4 @@
-"""Pictures to track in: cloth of many colours, in grey."""
+"""Gray images to track in, with a texture like cloth."""
 
 import cv2
 import numpy as np

@@ -136,7 +136,7 @@ def test_a_run_without_objects_is_refused_and_the_existing_file_stays(run, tmp_p
 
 @pytest.fixture
 def alone(run, tmp_path):
-    """A run of one object, which a test may damage."""
+    """A run of one object that a test may damage."""
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mug"))
     return replace(run, folder=folder, objects=run.objects[:1])
