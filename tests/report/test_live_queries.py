@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from browsing import browsing, opened, wait_until
+from browsing import Browser, browsing, opened, wait_until
 from poster import poster_camera, poster_map, poster_photo, poster_pose
 from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import PointDescriptors
@@ -134,9 +134,11 @@ def test_an_unknown_focal_length_is_optional(poster, queries):
 
 
 def test_a_running_localization_is_finished_at_the_end(poster, queries):
-    with opened(poster, None, queries) as view, browsing(view) as browser:
+    with opened(poster, None, queries) as view:
+        browser = Browser(view)
         browser.choose(browser.queries.names, "poster.png")
         browser.press(browser.queries.button)
         wait_until(view.busy.locked)
-    wait_until(lambda: "confidence" in browser.queries.message.content)
+    assert "confidence" in browser.queries.message.content
     assert browser.scene.get_handle_by_name("/queries/poster.png") is not None
+    browser.close()

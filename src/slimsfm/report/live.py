@@ -101,7 +101,8 @@ def live_view(
         try:
             yield view
         finally:
-            view.busy.acquire()  # wait for the running localization
+            with view.busy:  # wait for the running localization
+                view.viewers.clear()
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
@@ -197,7 +198,7 @@ class LiveView:
         return len(names) - len(self.photos)
 
     def localize(self, name: str, shown: str) -> tuple[Image, Localization]:
-        """Localize a query with one of the maps; one query at a time.
+        """Localize a query with one of the maps; the caller holds `busy`.
 
         Args:
             name: Name of the image.
@@ -207,14 +208,13 @@ class LiveView:
             SlimsfmError: The image cannot be read, or its focal length is unknown.
         """
         assert self.queries is not None
-        with self.busy:
-            options = LocalizationOptions(focal=self.queries.focal)
-            map_, path = self.maps[shown].map, self.queries.folder / name
-            image = self.queries.read(name)
-            camera = query_camera(map_, path, self.queries.camera, options.focal)
-            if shown not in self._localizers:
-                self._localizers[shown] = Localizer(map_, options)
-            return image, self._localizers[shown].localize(image, camera)
+        options = LocalizationOptions(focal=self.queries.focal)
+        map_, path = self.maps[shown].map, self.queries.folder / name
+        image = self.queries.read(name)
+        camera = query_camera(map_, path, self.queries.camera, options.focal)
+        if shown not in self._localizers:
+            self._localizers[shown] = Localizer(map_, options)
+        return image, self._localizers[shown].localize(image, camera)
 
     def _connect(self, client: viser.ClientHandle) -> None:
         self.viewers[client.client_id] = ViewerPanel(self, client)

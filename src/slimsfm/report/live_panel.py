@@ -84,6 +84,11 @@ class ViewerPanel:
         self.queries = QueryControls(view, self) if view.queries else None
         self._look_first()
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether the viewer is still there."""
+        return self.client.client_id in self._view.viewers
+
     def show(self, key: str) -> None:
         """Show one of the maps: its points, and the images that it has."""
         self.shown = key
@@ -136,6 +141,8 @@ class ViewerPanel:
         start, end = viser.transforms.SO3(camera.wxyz), viser.transforms.SO3(frustum.wxyz)
         turn = (start.inverse() @ end).log()
         for step in range(1, _FLIGHT_STEPS + 1):
+            if not self.is_connected:
+                return
             share = step / _FLIGHT_STEPS
             share = share * share * (3 - 2 * share)
             with self.client.atomic():
@@ -225,32 +232,45 @@ class QueryControls:
     def _localize(self) -> None:
         if self.button.disabled:
             return
-        name, key = self.names.value, self._viewer.shown
-        map_name = f", {key.lower()}" if len(self._view.maps) > 1 else ""
+        name = self.names.value
         self.button.disabled = True
-        try:
-            self.message.content = f"localizing {plain_markdown(name)} …"
-            self.message.content = f"**{plain_markdown(name)}**{map_name}: {self._outcome(name, key)}"
-        except SlimsfmError as error:
-            self.message.content = plain_markdown(str(error))
-        finally:
+        self.message.content = f"localizing {plain_markdown(name)} …"
+        with self._view.busy:
+            if not self._viewer.is_connected:
+                return
+            outcome = self._outcome(name)
+            if not self._viewer.is_connected:
+                return
+            self.message.content = outcome
             self.button.disabled = False
         if name in self._frusta:
             self._viewer.fly_to(self._frusta[name])
 
-    def _outcome(self, name: str, key: str) -> str:
+    def _outcome(self, name: str) -> str:
         """Localize a query, show its pose, and describe it."""
+        key = self._viewer.shown
         if name in self._frusta:
             self._frusta.pop(name).remove()
-        image, found = self._view.localize(name, key)
+        try:
+            image, found = self._view.localize(name, key)
+        except SlimsfmError as error:
+            return plain_markdown(str(error))
+        map_name = f", {key.lower()}" if len(self._view.maps) > 1 else ""
+        title = f"**{plain_markdown(name)}**{map_name}"
         if found.pose is None:
-            return f"not localized, {_times(found.seconds)}"
-        node, pose = f"/queries/{quote(name, safe='')}", found.pose
-        photo = shrink(image, MAX_PHOTO_PX)
-        frustum = self._viewer.add_frustum(node, found.camera, pose.cam_from_world, QUERY_RGB, photo)
+            return f"{title}: not localized, {_times(found.seconds)}"
+        if self._viewer.is_connected:  # still
+            self._show_pose(name, image, found.camera, found.pose.cam_from_world)
+        inliers = f"{found.pose.num_inliers} inliers"
+        return f"{title}: confidence {found.pose.confidence:.2f}, {inliers}, {_times(found.seconds)}"
+
+    def _show_pose(
+        self, name: str, image: Image, camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d
+    ) -> None:
+        node, photo = f"/queries/{quote(name, safe='')}", shrink(image, MAX_PHOTO_PX)
+        frustum = self._viewer.add_frustum(node, camera, cam_from_world, QUERY_RGB, photo)
         frustum.on_click(lambda _: self._viewer.fly_to(frustum))
         self._frusta[name] = frustum
-        return f"confidence {pose.confidence:.2f}, {pose.num_inliers} inliers, {_times(found.seconds)}"
 
 
 def plain_markdown(text: str) -> str:
