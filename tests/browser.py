@@ -24,10 +24,10 @@ _COMPLAINTS = ("error", "warning", "assert")
 
 @contextmanager
 def open_page(path: Path, profile: Path):
-    """The page of a file, once it is loaded; `profile` is an empty folder for what the browser keeps."""
+    """Open the page of a file; `profile` is an empty folder for the browser's state."""
     program = next((found for name in _PROGRAMS if (found := shutil.which(name))), None)
     if program is None:
-        pytest.skip(f"browsing needs one of {', '.join(_PROGRAMS)}, of which there is none")
+        pytest.skip(f"browsing needs one of {', '.join(_PROGRAMS)}, none of which is installed")
     flags = ("--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--remote-allow-origins=*")
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen([program, *flags, f"--user-data-dir={profile}", "about:blank"], **quiet)
@@ -44,7 +44,7 @@ def open_page(path: Path, profile: Path):
 
 
 def _address(process: subprocess.Popen, port_file: Path) -> str:
-    """Where the browser listens, once it does."""
+    """Wait until the browser listens; return its address."""
     deadline = time.monotonic() + _PATIENCE_S
     while time.monotonic() < deadline and process.poll() is None:
         lines = port_file.read_text().split("\n") if port_file.exists() else []
@@ -55,7 +55,7 @@ def _address(process: subprocess.Popen, port_file: Path) -> str:
 
 
 class Page:
-    """A page, and all that happened on it."""
+    """A page and its events."""
 
     def __init__(self, address: str) -> None:
         self._socket = websocket.create_connection(address, timeout=_PATIENCE_S)
@@ -68,7 +68,7 @@ class Page:
             self.send(f"{domain}.enable")
 
     def send(self, method: str, **params) -> dict:
-        """Give a command and wait for its result; what happens meanwhile goes into `events`."""
+        """Send a command and wait for its result; other messages are appended to `events`."""
         self._count += 1
         session = {"sessionId": self._session} if self._session else {}
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": params, **session}))
@@ -80,14 +80,14 @@ class Page:
             self.events.append(message)
 
     def open(self, path: Path) -> None:
-        """Open a file, and wait until it is loaded and drawn."""
+        """Open a file and wait until it is loaded and drawn."""
         self.send("Page.navigate", url=path.absolute().as_uri())
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self.events.append(json.loads(self._socket.recv()))
         self.settle()
 
     def settle(self) -> None:
-        """Wait until what was begun is drawn."""
+        """Wait until pending changes are drawn."""
         frame = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
         self.send("Runtime.evaluate", expression=frame, awaitPromise=True)
 
@@ -98,19 +98,19 @@ class Page:
         return found["result"].get("value")
 
     def resize(self, width: int, height: int, *, mobile: bool = False) -> None:
-        """Give the window another size."""
+        """Resize the window."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
         self.send("Emulation.setDeviceMetricsOverride", **size)
         self.settle()
 
     def prefer(self, scheme: str) -> None:
-        """Prefer "light" or "dark" colours."""
+        """Prefer "light" or "dark" colors."""
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         self.send("Emulation.setEmulatedMedia", features=features)
         self.settle()
 
     def middle(self, selector: str) -> tuple[float, float]:
-        """Where the middle of an element is in the window, into which it is scrolled."""
+        """Scroll to an element; return the position of its center in the window."""
         element = f"document.querySelector({json.dumps(selector)})"
         self.run(f"{element}.scrollIntoView({{block: 'center'}})")
         x, y, width, height = self.run(
@@ -124,12 +124,12 @@ class Page:
         self.send("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, buttons=int(down), **button)
 
     def hover(self, selector: str) -> None:
-        """Point at the middle of an element."""
+        """Point at the center of an element."""
         self.mouse("Moved", *self.middle(selector))
         self.settle()
 
     def click(self, selector: str) -> None:
-        """Click on the middle of an element."""
+        """Click on the center of an element."""
         x, y = self.middle(selector)
         self.mouse("Moved", x, y)
         self.mouse("Pressed", x, y, down=True)
@@ -137,7 +137,7 @@ class Page:
         self.settle()
 
     def drag(self, selector: str, dx: float, dy: float) -> None:
-        """Drag from the middle of an element."""
+        """Drag from the center of an element."""
         x, y = self.middle(selector)
         self.mouse("Pressed", x, y, down=True)
         for share in (0.5, 1.0):
@@ -146,25 +146,25 @@ class Page:
         self.settle()
 
     def press(self, key: str) -> None:
-        """Press a key on what has the focus."""
+        """Press a key on the focused element."""
         for kind in ("keyDown", "keyUp"):
             self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key)
         self.settle()
 
     def pixels(self, selector: str) -> np.ndarray:
-        """What a canvas holds, as RGBA."""
+        """Content of a canvas, RGBA."""
         data = self.run(f"document.querySelector({json.dumps(selector)}).toDataURL()").partition(",")[2]
         with Image.open(BytesIO(base64.b64decode(data))) as image:
             return np.array(image.convert("RGBA"))
 
     def screenshot(self) -> np.ndarray:
-        """What the window shows, as RGB."""
+        """Content of the window, RGB."""
         data = self.send("Page.captureScreenshot", format="png")["data"]
         with Image.open(BytesIO(base64.b64decode(data))) as image:
             return np.array(image.convert("RGB"))
 
     def complaints(self) -> list[str]:
-        """Errors and warnings that the page or the browser told of."""
+        """Errors and warnings of the page or the browser."""
         found = []
         for event in self.events:
             method, params = event["method"], event["params"]
@@ -177,7 +177,7 @@ class Page:
         return found
 
     def requests(self) -> list[str]:
-        """Addresses that were asked for, but for those that hold their data."""
+        """Requested addresses, except for data URIs."""
         sent = [one["params"] for one in self.events if one["method"] == "Network.requestWillBeSent"]
         addresses = [params["request"]["url"] for params in sent]
         return [address for address in addresses if not address.startswith("data:")]

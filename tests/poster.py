@@ -1,4 +1,4 @@
-"""A poster on a wall and its map: real photos, real features and exact geometry in a fraction of a second."""
+"""A poster on a wall and its map: photos, real features and exact geometry in a fraction of a second."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from slimsfm.synthetic.trajectory import look_at
 WIDTH, HEIGHT = 320, 240
 _SIDE_PX = 400
 _EYES = [(-0.6, 0, -3.0), (0, 0.2, -3.2), (0.6, 0, -3.0), (0, -0.4, -3.0)]
-_SAME_PX = 1.0  # distance between keypoints that see the same point
+_SAME_PX = 1.0  # largest distance between keypoints of the same point
 
 
 def poster_camera() -> pycolmap.Camera:
@@ -21,12 +21,12 @@ def poster_camera() -> pycolmap.Camera:
 
 
 def poster_pose(eye) -> pycolmap.Rigid3d:
-    """A camera that looks at the middle of the poster, which hangs where z is 0."""
+    """A camera that looks at the center of the poster in the plane z = 0."""
     return look_at(np.array(eye, float), np.zeros(3))
 
 
 def poster_photo(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
-    """What a camera sees of the poster: two units wide and high, around the origin."""
+    """A photo of the poster, which is two units wide and high, around the origin."""
     noise = np.random.default_rng(0).random((_SIDE_PX, _SIDE_PX, 3)).astype(np.float32)
     poster = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
     world_from_poster = np.array([[2 / _SIDE_PX, 0, -1], [0, 2 / _SIDE_PX, -1], [0, 0, 1]])
@@ -35,7 +35,7 @@ def poster_photo(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
 
 
 def poster_map() -> Map:
-    """Four photos; each keypoint of the first that some other photo has too is a point."""
+    """A map of four photos; each keypoint of the first photo that another one has too is a point."""
     extractor, camera = load_extractor("sift"), poster_camera()
     poses = {f"{number}.png": poster_pose(eye) for number, eye in enumerate(_EYES, start=1)}
     features = {name: extractor.extract(poster_photo(pose)) for name, pose in poses.items()}
@@ -60,7 +60,7 @@ def poster_map() -> Map:
 
 
 def _on_wall(points2D: np.ndarray, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> np.ndarray:
-    """Where the rays of pixels meet the wall."""
+    """Intersections of the rays of pixels with the wall."""
     world_from_cam = cam_from_world.inverse()
     on_plane = np.asarray(camera.cam_from_img(points2D)).reshape(-1, 2)
     rays = np.column_stack([on_plane, np.ones(len(points2D))]) @ world_from_cam.rotation.matrix().T

@@ -1,4 +1,4 @@
-"""The command serves until it is interrupted, and says in one line what it cannot serve."""
+"""The command serves until it is interrupted, and refuses wrong input in one line."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ pytest.importorskip("viser", reason="the live view needs viser: pip install 'sli
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A map, a smaller one made of it, and two of its four photos, one of them as a query too."""
+    """A map, a map reduced from it, and two of its four photos, one of them also as a query."""
     folder = tmp_path_factory.mktemp("poster")
     full = poster_map()
     write_map(full, folder / "map")
@@ -55,15 +55,21 @@ def test_the_page_is_served_until_interrupted(folder, how):
     )
     try:
         first = process.stdout.readline()
-        assert first.endswith(" shows map and small; Ctrl-C ends it\n")
+        assert first.endswith(" shows map and small; Ctrl-C stops it\n")
         assert "<html" in urlopen(first.split()[0]).read().decode()
         assert process.stdout.readline() == "photos: 2 of 4 photos are missing or unreadable\n"
         process.send_signal(how)
         out, err = process.communicate(timeout=20)
     finally:
         process.kill()
-    assert (process.returncode, out) == (130, "")
-    assert err.strip() == "slimsfm: interrupted; nothing half-made was left behind"
+    assert (process.returncode, out) == (0, "stopped\n")
+    assert err.strip() == ""
+
+
+def test_missing_weights_are_named(folder, monkeypatch):
+    monkeypatch.setenv("SLIMSFM_WEIGHTS", "")
+    line = refusal(folder / "map", "--weights", folder / "nowhere", "--port", 0)
+    assert str(folder / "nowhere") in line
 
 
 def test_missing_folders_are_named(folder):
@@ -80,13 +86,13 @@ def test_a_port_in_use_is_named(folder):
         assert f"port {port} of localhost cannot be served" in refusal(folder / "map", "--port", port)
 
 
-def test_a_map_of_other_origin_is_refused(folder, tmp_path):
+def test_a_map_that_was_not_reduced_from_the_other_is_refused(folder, tmp_path):
     write_map(exact_map(), tmp_path / "stranger")
     line = refusal(folder / "map", "--reduced", tmp_path / "stranger", "--port", 0)
     assert line == "slimsfm: reduced: its image '001.png' is not in the map; give a map reduced from it"
 
 
-def test_without_viser_it_says_what_to_install(folder, monkeypatch):
+def test_without_viser_the_command_says_what_to_install(folder, monkeypatch):
     for name in [one for one in sys.modules if one.startswith("slimsfm.report.live")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "viser", None)

@@ -14,7 +14,7 @@ BOX = Box(np.zeros(3), np.diag([0.5, 0.4, 0.3]))
 
 
 def looking_at_origin(angle):
-    """A camera 3 before the origin, turned about the vertical, its y axis down along the world's -z."""
+    """A camera at distance 3 from the origin, rotated about the vertical, its y axis along the world's -z."""
     back = np.array([np.cos(angle), np.sin(angle), 0.0])
     down = np.array([0.0, 0.0, -1.0])
     rotation = np.stack([np.cross(down, -back), down, -back])
@@ -61,7 +61,7 @@ def reduced(full):
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory) -> Run:
-    """A run over two objects, whose folder no test changes."""
+    """A run of two objects; tests must not change its folder."""
     return make_run(tmp_path_factory.mktemp("run"), {"can": 10, "mug": 11})
 
 

@@ -1,4 +1,4 @@
-"""A run of a benchmark over exact scenes, measured as the command measures it, in a second."""
+"""A benchmark run of exact scenes, measured like the command does, in a second."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -23,12 +23,12 @@ from slimsfm.mapping.subset import keep_images
 from slimsfm.reduction import DominatingSetOptions, dominating_set
 
 _OPTIONS = BenchmarkOptions(strategies=("exhaustive", "direct"))
-_HARD = 14  # keypoints of the last query, which slim maps do not localize
-_REACH_DEG = 55.0  # of what a camera sees: no image localizes all others
+_HARD = 14  # keypoints of the last query, which reduced maps do not localize
+_REACH_DEG = 55.0  # field of view: no image localizes all others
 
 
 def make_run(folder: Path, objects: Mapping[str, int]) -> Run:
-    """Measure objects of so many images each, every third of which is a query, and write all that."""
+    """Measure objects with these numbers of images, every third one a query, and write the results."""
     run = Run(
         folder=folder,
         dataset="Exact scenes",
@@ -117,7 +117,7 @@ def _trial(map_: Map, strategy: str, prepared: list[PreparedQuery]) -> MapRun:
 
 
 def _photograph(map_: Map, folder: Path) -> None:
-    """Draw what each image of a map sees: its points as discs on a ground of its own."""
+    """Draw the points that each image of a map sees as discs on a plain background."""
     folder.mkdir(parents=True)
     for number, (name, image) in enumerate(map_.images.items()):
         camera = map_.camera(name)

@@ -1,4 +1,4 @@
-"""`slimsfm figures`: everything that a run can show, as files."""
+"""`slimsfm figures`: all figures of a run as files."""
 
 import json
 import shutil
@@ -12,14 +12,14 @@ from PIL import Image
 
 from commands import Outcome, contents, slimsfm
 from slimsfm.evaluation.result_files import read_run
-from slimsfm.report.query_video import DrawnQuery, drawn_queries, film_frame
+from slimsfm.report.figure_files import DrawnQuery, draw_queries, query_video_frame
 
 SHARED = ("frontier", "reliability-sift")
 OF_METHOD = ("before-after", "graph", "sphere", "reliability")
 
 
 def of_one_object(run, folder):
-    """A copy of a run, of its first object alone, which a test may change."""
+    """A copy of a run with its first object only, which a test may change."""
     shutil.copytree(run.folder, folder)
     path = folder / "results.json"
     data = json.loads(path.read_text().replace(str(run.folder), str(folder)))
@@ -41,7 +41,7 @@ class Redrawn:
 
 @pytest.fixture(scope="module")
 def redrawn(run, tmp_path_factory):
-    """Figures of a run whose photos are gone, drawn into a folder where there is something."""
+    """Figures of a run without photos, drawn into a folder with other files."""
     folder = tmp_path_factory.mktemp("redrawn")
     small, output = of_one_object(run, folder / "run"), folder / "out"
     shutil.rmtree(small / "photos")
@@ -72,7 +72,7 @@ def of_object(name, suffix, queries):
     return names | {f"{name}/sift/queries/{query}.jpg" for query in queries}
 
 
-def test_every_figure_of_every_object_is_written_under_a_name_one_can_guess(run, drawn):
+def test_every_figure_of_every_object_is_written(run, drawn):
     _, output = drawn
     expected = {f"{name}.png" for name in SHARED}
     for result in run.objects:
@@ -84,16 +84,16 @@ def test_every_figure_of_every_object_is_written_under_a_name_one_can_guess(run,
         assert pixels.std() > 5
 
 
-def test_the_index_names_each_file_and_says_what_it_shows(drawn):
+def test_each_file_is_listed_with_an_explanation(drawn):
     out, output = drawn
     listed = [line.split()[0] for line in out.splitlines() if line.startswith(f"{output}/")]
     written = {str(output / name) for name in files(output) if "/queries/" not in name}
     written |= {str(output / name / "sift" / "queries") for name in ("can", "mug")}
     assert set(listed) == written
-    assert "accuracy over size and time" in out
+    assert "accuracy over map size and query time" in out
 
 
-def test_queries_are_drawn_with_both_boxes_and_filmed(run, drawn):
+def test_queries_are_drawn_with_both_boxes_as_images_and_video(run, drawn):
     av = pytest.importorskip("av")
     _, output = drawn
     for result in run.objects:
@@ -105,45 +105,45 @@ def test_queries_are_drawn_with_both_boxes_and_filmed(run, drawn):
             assert sum(1 for _ in container.decode(video=0)) == len(result.queries)
 
 
-def test_queries_of_equal_names_are_numbered_and_those_without_a_photo_left_out(run):
+def test_queries_of_equal_names_are_numbered_and_missing_photos_are_left_out(run):
     result = run.objects[0]
     paths = [Path(folder, "1.png") for folder in "abc"]
     queries = tuple(replace(one, path=path) for one, path in zip(result.queries, paths, strict=True))
     photo = np.zeros((480, 640, 3), np.uint8)
-    outcomes = result.measurements[0].map_runs[0].outcomes
-    named = drawn_queries(
+    outcomes = result.cells[0].trials[0].outcomes
+    named = draw_queries(
         replace(result, queries=queries), outcomes, lambda path: None if path == paths[1] else photo
     )
     assert [(one.name, one.caption[:3]) for one in named] == [("0000-1", "1/3"), ("0002-1", "3/3")]
 
 
-def test_every_frame_of_a_film_has_its_size_and_tells_the_error():
+def test_every_frame_of_a_video_has_its_size_and_a_caption():
     white = np.full((40, 20, 3), 255, np.uint8)
     for caption, is_longer in (("", False), ("1/2  0.3 % of d", True)):
-        frame = film_frame(DrawnQuery(name="a", image=white, caption=caption), 120, 200)
+        frame = query_video_frame(DrawnQuery(name="a", image=white, caption=caption), 120, 200)
         assert frame.shape == (120, 200, 3)
         assert (frame[40:80, 90:110] == 255).all()
         assert (frame[:100, :90] == 0).all()
         assert (frame[100:, :90] > 128).any() == is_longer
-    large = film_frame(DrawnQuery(name="a", image=np.tile(white, (10, 10, 1)), caption=""), 120, 200)
+    large = query_video_frame(DrawnQuery(name="a", image=np.tile(white, (10, 10, 1)), caption=""), 120, 200)
     assert (large[:100, 70:130] == 255).all()
     assert (large[:, :70] == 0).all()
 
 
-def test_photos_that_are_gone_are_told_of_once_and_the_rest_is_drawn(redrawn):
+def test_missing_photos_are_reported_once_and_the_rest_is_drawn(redrawn):
     assert (redrawn.done.code, redrawn.done.err.strip()) == (0, "")
     assert redrawn.done.out.count("no such image") == 1
     assert files(redrawn.output) == of_object("can", "svg", []) | {"notes.txt"}
 
 
-def test_what_is_there_is_replaced_where_asked_and_the_rest_stays(redrawn):
+def test_existing_figures_are_replaced_on_request_and_other_files_stay(redrawn):
     assert redrawn.refusal.code == 2
     assert str(redrawn.output) in redrawn.refusal.err
     assert (redrawn.output / "can" / "frontier.svg").read_text().startswith("<?xml")
     assert (redrawn.output / "notes.txt").read_text() == "mine"
 
 
-def test_without_pyav_it_says_what_to_install_and_goes_on(small, tmp_path, monkeypatch):
+def test_without_pyav_the_command_says_what_to_install_and_continues(small, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     done = slimsfm("figures", small, "-o", tmp_path / "out", "--format", "svg")
     assert done.code == 0, done.err
@@ -173,7 +173,7 @@ def test_wrong_input_is_refused_in_one_line(small, tmp_path, arguments, said):
     assert contents(small) == before
 
 
-def test_a_map_that_is_gone_is_told_of(small, tmp_path):
+def test_a_missing_map_is_named(small, tmp_path):
     full = small / "maps" / "can" / "sift" / "full"
     shutil.rmtree(full)
     refusal = slimsfm("figures", small, "-o", tmp_path / "out")

@@ -29,7 +29,7 @@ def query(camera, *, estimated=None, true=AWAY, label="query.jpg", verdict=""):
 
 
 def has_color(image, color, xy):
-    """Whether the pixel that holds a point is of a colour."""
+    """Whether the pixel that holds a point has a color."""
     column, row = np.floor(xy).astype(int)
     return np.abs(image[row, column].astype(int) - color).max() < 60
 
@@ -60,7 +60,7 @@ def test_only_the_edges_are_drawn(camera):
     assert gaps.max() < 4
 
 
-def test_both_boxes_are_seen_also_where_they_coincide(camera):
+def test_both_boxes_are_visible_even_if_they_coincide(camera):
     for estimated in (AHEAD, ASIDE):
         image = draw_frame(query(camera, estimated=estimated, true=AHEAD), BOX, MAX_SIZE).astype(int)
         for color in (ESTIMATED_RGB, TRUE_RGB):
@@ -72,7 +72,7 @@ def test_boxes_behind_the_camera_are_not_drawn(camera):
     np.testing.assert_array_equal(draw_frame(frame, BOX, MAX_SIZE), frame.image)
 
 
-def test_of_a_box_around_the_camera_the_part_ahead_is_drawn(camera):
+def test_of_a_box_around_the_camera_the_part_in_front_is_drawn(camera):
     inside = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, -0.1]))
     box = Box(np.zeros(3), np.diag([0.05, 0.05, 2.0]))
     image = draw_frame(query(camera, estimated=inside), box, MAX_SIZE)
@@ -81,7 +81,7 @@ def test_of_a_box_around_the_camera_the_part_ahead_is_drawn(camera):
         assert has_color(image, ESTIMATED_RGB, project(ahead[None], inside, camera)[0])
 
 
-def test_what_distortion_folds_back_into_the_image_is_not_drawn():
+def test_points_that_distortion_folds_back_into_the_image_are_not_drawn():
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 300.0, 320, 240)
     camera.params = np.array([300.0, 160.0, 120.0, -0.1])
     far_aside = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([3.15, 0.0, 1.0]))
@@ -99,7 +99,7 @@ def test_a_large_image_is_scaled_down_with_its_box():
     assert all(has_color(image, ESTIMATED_RGB, xy) for xy in corners)
 
 
-def test_the_page_holds_the_drawn_image_and_what_became_of_it(camera):
+def test_the_page_embeds_the_drawn_image_and_its_caption(camera):
     frame = query(camera, estimated=ASIDE, true=AHEAD, label="<b>.jpg", verdict="off by <2 %")
     html = frame_html(frame, BOX, MAX_SIZE)
     data = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', html)
@@ -110,7 +110,7 @@ def test_the_page_holds_the_drawn_image_and_what_became_of_it(camera):
 
 
 def test_a_camera_of_another_size_is_refused(camera):
-    with pytest.raises(ValueError, match="camera is of 320x240 pixels, the image of 10x20"):
+    with pytest.raises(ValueError, match="camera has 320x240 pixels, the image 10x20"):
         QueryFrame(
             image=np.zeros((20, 10, 3), np.uint8),
             camera=camera,

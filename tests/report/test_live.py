@@ -1,4 +1,3 @@
-import re
 import socket
 from dataclasses import replace
 
@@ -9,34 +8,40 @@ from PIL import Image
 
 from browsing import browsing, opened, viser, wait_until
 from slimsfm.errors import InputError
+from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.subset import copy_images, copy_points, direct_map
-from slimsfm.report.live import WeighedMap, live_view, plain
-from slimsfm.report.live_stage import DROPPED_RGB, KEPT_RGB
+from slimsfm.mapping.subset import copy_images, copy_points
+from slimsfm.report.live import MapWithSize, live_view
+from slimsfm.report.live_panel import DROPPED_RGB, KEPT_RGB, plain_markdown
 from slimsfm.report.scene3d import view_frame
 
 
-def is_seen(view, name):
-    """Whether a node and all above it are shown."""
+def is_visible(browser, name):
+    """Whether a node and its ancestors are visible."""
     parts = name.split("/")
-    above = ["/".join(parts[:end]) for end in range(2, len(parts) + 1)]
-    handles = [view.server.scene.get_handle_by_name(one) for one in above]
+    ancestors = ["/".join(parts[:end]) for end in range(2, len(parts) + 1)]
+    handles = [browser.scene.get_handle_by_name(one) for one in ancestors]
     return handles[-1] is not None and all(handle is None or handle.visible for handle in handles)
 
 
-def seen_images(view):
-    return {name: one.color for name, one in view.frustums.items() if is_seen(view, one.name)}
+def visible_images(browser):
+    return {name: one.color for name, one in browser.viewer.frusta.items() if is_visible(browser, one.name)}
 
 
-def seen_points(view):
-    (name,) = [f"/{word}/points" for word in view.maps if is_seen(view, f"/{word}/points")]
-    return view.server.scene.get_handle_by_name(name)
+def visible_points(browser):
+    (points,) = [one for one in browser.viewer.points.values() if is_visible(browser, one.name)]
+    return points
 
 
-def said(view):
-    """All text of the panel."""
-    handles = view.server.gui._container_handle_from_uuid["root"]._children.values()
-    return "\n".join(one.content for one in handles if isinstance(one, viser.GuiMarkdownHandle))
+def descriptions(browser):
+    return [one.content for one in browser.viewer.descriptions.values()]
+
+
+@pytest.fixture
+def watching(full):
+    """A view of a map, and a browser."""
+    with opened(full) as view, browsing(view) as browser:
+        yield view, browser
 
 
 def for_direct_matching(full, rows):
@@ -53,96 +58,119 @@ def moved(map):
     return replace(map, model=model)
 
 
-def test_one_map_is_shown_with_its_points_and_images(full):
-    with opened(full) as view:
-        assert seen_images(view) == dict.fromkeys(full.images, KEPT_RGB)
-        frame = view_frame([image.cam_from_world() for image in full.images.values()], full.box)
-        points = seen_points(view)
-        np.testing.assert_allclose(points.points, frame.apply(full.points3D_in_world), atol=1e-6)
-        np.testing.assert_array_equal(points.colors, full.colors)
-        assert "4 images, 30 points, 24 MB" in said(view)
-        assert view.switch == {}
+def test_one_map_is_shown_with_its_points_and_images(full, watching):
+    _, browser = watching
+    assert visible_images(browser) == dict.fromkeys(full.images, KEPT_RGB)
+    frame = view_frame([image.cam_from_world() for image in full.images.values()], full.box)
+    points = visible_points(browser)
+    np.testing.assert_allclose(points.points, frame.apply(full.points3D_in_world), atol=1e-6)
+    np.testing.assert_array_equal(points.colors, full.colors)
+    assert descriptions(browser) == ["4 images, 30 points, 24 MB"]
+    assert browser.viewer.switch == {}
 
 
-def test_the_box_has_its_twelve_edges(full):
-    with opened(full) as view:
-        edges = view.server.scene.get_handle_by_name("/box").points
-        lengths = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1) * full.box.diagonal
-        np.testing.assert_allclose(np.sort(lengths), np.repeat([0.6, 0.8, 1.0], 4), atol=1e-6)
+def test_the_box_has_its_twelve_edges(full, watching):
+    _, browser = watching
+    edges = browser.viewer.box.points
+    lengths = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1) * full.box.diagonal
+    np.testing.assert_allclose(np.sort(lengths), np.repeat([0.6, 0.8, 1.0], 4), atol=1e-6)
 
 
 def unit(rows):
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def test_frustums_stand_where_the_cameras_stood_and_span_what_they_saw(full, camera):
+def test_frusta_are_at_the_cameras_and_span_their_images(full, camera, watching):
+    _, browser = watching
     poses = [image.cam_from_world() for image in full.images.values()]
     frame = view_frame(poses, full.box)
     on_plane = camera.cam_from_img(np.array([[0, 0], [320, 0], [320, 240], [0, 240.0]]))
     corners_in_cam = np.column_stack([on_plane, np.ones(4)])
-    with opened(full) as view:
-        for pose, one in zip(poses, view.frustums.values(), strict=True):
-            (center,) = frame.apply(pose.inverse().translation[None])
-            np.testing.assert_allclose(one.position, center, atol=1e-6)
-            y = np.tan(one.fov / 2)
-            corners = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) * [y * one.aspect, y, 1]
-            in_view = corners @ viser.transforms.SO3(one.wxyz).as_matrix().T
-            expected = frame.apply(pose.inverse() * corners_in_cam) - center
-            np.testing.assert_allclose(unit(in_view), unit(expected), atol=1e-6)
+    for pose, one in zip(poses, browser.viewer.frusta.values(), strict=True):
+        (center,) = frame.apply(pose.inverse().translation[None])
+        np.testing.assert_allclose(one.position, center, atol=1e-6)
+        y = np.tan(one.fov / 2)
+        corners = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]) * [y * one.aspect, y, 1]
+        in_view = corners @ viser.transforms.SO3(one.wxyz).as_matrix().T
+        expected = frame.apply(pose.inverse() * corners_in_cam) - center
+        np.testing.assert_allclose(unit(in_view), unit(expected), atol=1e-6)
 
 
-def test_before_tells_kept_from_dropped_images_and_after_shows_only_what_is_kept(full, reduced):
+def test_before_marks_kept_and_dropped_images_and_after_shows_the_kept_ones(full, reduced):
     with opened(full, reduced) as view, browsing(view) as browser:
         dropped = dict.fromkeys(("1.jpg", "3.jpg", "4.jpg"), DROPPED_RGB)
-        assert seen_images(view) == {**dropped, "2.jpg": KEPT_RGB}
-        assert len(seen_points(view).points) == 30
-        assert re.search(r"4 images, 30 points, 24 MB\n1 image, 20 points, 24 MB", said(view))
-        browser.press(view.switch["After"])
-        wait_until(lambda: seen_images(view) == {"2.jpg": KEPT_RGB})
-        assert len(seen_points(view).points) == 20
-        browser.press(view.switch["Before"])
-        wait_until(lambda: len(seen_images(view)) == 4)
+        assert visible_images(browser) == {**dropped, "2.jpg": KEPT_RGB}
+        assert len(visible_points(browser).points) == 30
+        assert descriptions(browser) == ["4 images, 30 points, 24 MB", "1 image, 20 points, 24 MB"]
+        browser.press(browser.viewer.switch["After"])
+        wait_until(lambda: visible_images(browser) == {"2.jpg": KEPT_RGB})
+        assert len(visible_points(browser).points) == 20
+        browser.press(browser.viewer.switch["Before"])
+        wait_until(lambda: len(visible_images(browser)) == 4)
 
 
-def test_of_a_map_for_direct_matching_only_the_points_are_left(full):
-    with opened(full, for_direct_matching(full, [1, 5, 8])) as view:
-        assert seen_images(view) == dict.fromkeys(full.images, DROPPED_RGB)
-        view.show("After")
-        assert seen_images(view) == {}
-        assert len(seen_points(view).points) == 3
-        assert "\n3 points, 24 MB" in said(view)
+def test_each_viewer_has_its_own_switch_and_camera(full, reduced):
+    with opened(full, reduced) as view, browsing(view) as one, browsing(view) as other:
+        position = other.camera.position.copy()
+        one.press(one.viewer.switch["After"])
+        wait_until(lambda: len(visible_images(one)) == 1)
+        one.click(one.viewer.frusta["2.jpg"])
+        wait_until(lambda: "2" in one.viewer.message.content)
+        assert len(visible_images(other)) == 4
+        assert other.viewer.shown == "Before"
+        assert "Click" in other.viewer.message.content
+        np.testing.assert_array_equal(other.camera.position, position)
 
 
-def test_a_map_for_direct_matching_by_itself_has_cameras_that_see_nothing(full):
+def test_the_size_of_the_points_can_be_changed(watching):
+    _, browser = watching
+    before = visible_points(browser).point_size
+    browser.set(browser.viewer.point_size, 0.5)
+    wait_until(lambda: visible_points(browser).point_size == pytest.approx(before / 2))
+
+
+def test_a_map_for_direct_matching_shows_only_points(full):
+    with opened(full, for_direct_matching(full, [1, 5, 8])) as view, browsing(view) as browser:
+        assert visible_images(browser) == dict.fromkeys(full.images, DROPPED_RGB)
+        browser.press(browser.viewer.switch["After"])
+        wait_until(lambda: visible_images(browser) == {})
+        assert len(visible_points(browser).points) == 3
+        assert descriptions(browser)[1] == "3 points, 24 MB"
+
+
+def test_cameras_of_a_single_map_for_direct_matching_see_no_points(full):
     with opened(for_direct_matching(full, [1, 5, 8])) as view, browsing(view) as browser:
-        assert seen_images(view) == dict.fromkeys(full.images, KEPT_RGB)
-        browser.click(view.frustums["2.jpg"])
-        wait_until(lambda: view.told.content == f"**{plain('2.jpg')}**")
+        assert visible_images(browser) == dict.fromkeys(full.images, KEPT_RGB)
+        browser.click(browser.viewer.frusta["2.jpg"])
+        wait_until(lambda: browser.viewer.message.content == f"**{plain_markdown('2.jpg')}**")
 
 
-def test_photos_fill_frustums_small_and_missing_ones_are_counted(full, tmp_path):
+def test_photos_are_shown_in_frusta_and_missing_ones_are_counted(watching, tmp_path):
+    view, browser = watching
     for name in ("1.jpg", "3.jpg"):
         Image.new("RGB", (1280, 960), (255, 0, 0)).save(tmp_path / name)
     (tmp_path / "4.jpg").write_text("no image")
-    with opened(full) as view:
-        assert view.show_photos(tmp_path) == 2
-        shapes = {name: None if one.image is None else one.image.shape for name, one in view.frustums.items()}
-        assert shapes == {"1.jpg": (240, 320, 3), "2.jpg": None, "3.jpg": (240, 320, 3), "4.jpg": None}
+    assert view.show_photos(tmp_path) == 2
+    with browsing(view) as late:
+        for one in (browser, late):
+            images = {name: frustum.image for name, frustum in one.viewer.frusta.items()}
+            shapes = {name: None if image is None else image.shape for name, image in images.items()}
+            assert shapes == {"1.jpg": (240, 320, 3), "2.jpg": None, "3.jpg": (240, 320, 3), "4.jpg": None}
 
 
-def test_a_click_on_an_image_looks_from_there_and_tells_what_it_sees(full, reduced):
+def test_a_click_on_an_image_flies_to_its_camera_and_counts_its_points(full, reduced):
     with opened(full, reduced) as view, browsing(view) as browser:
-        clicked = view.frustums["2.jpg"]
+        clicked = browser.viewer.frusta["2.jpg"]
         browser.click(clicked)
-        wait_until(lambda: plain("2.jpg") in view.told.content)
-        assert "sees 20 points" in view.told.content
+        wait_until(lambda: plain_markdown("2.jpg") in browser.viewer.message.content)
+        assert "sees 20 points" in browser.viewer.message.content
+        wait_until(lambda: abs(browser.camera.wxyz @ clicked.wxyz) > 1 - 1e-9)
+        wait_until(
+            lambda: np.abs(browser.camera.look_at).max() < 1e-6
+        )  # the cameras look at the box's center
         axis = viser.transforms.SO3(clicked.wxyz).as_matrix()[:, 2]
         ahead = browser.camera.position - clicked.position
         assert 0 < ahead @ axis == pytest.approx(np.linalg.norm(ahead))
-        assert abs(browser.camera.wxyz @ clicked.wxyz) == pytest.approx(1)
-        np.testing.assert_allclose(
-            browser.camera.look_at, 0, atol=1e-6
-        )  # the cameras look at the box's middle
 
 
 def test_a_view_ends_with_its_context(full):
@@ -153,24 +181,24 @@ def test_a_view_ends_with_its_context(full):
         socket.create_connection(("localhost", port))
 
 
-def test_a_port_that_cannot_be_had_is_refused(full):
-    weighed = WeighedMap(map=full, num_bytes=1)
+def test_an_unavailable_port_is_refused(full):
+    with_size = MapWithSize(map=full, num_bytes=1)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port} of localhost"), live_view(weighed, port=port):
+        with pytest.raises(InputError, match=f"port {port} of localhost"), live_view(with_size, port=port):
             pass
-    with pytest.raises(InputError, match="got 70000"), live_view(weighed, port=70_000):
+    with pytest.raises(InputError, match="got 70000"), live_view(with_size, port=70_000):
         pass
-    with pytest.raises(InputError, match=r"nowhere\.invalid"), live_view(weighed, host="nowhere.invalid"):
+    with pytest.raises(InputError, match=r"nowhere\.invalid"), live_view(with_size, host="nowhere.invalid"):
         pass
 
 
 def test_maps_without_a_common_frame_are_refused(full, reduced):
     with pytest.raises(InputError, match=r"'1\.jpg' is not in the map"), opened(reduced, full):
         pass
-    with pytest.raises(InputError, match=r"'2\.jpg' stands elsewhere"), opened(full, moved(reduced)):
+    with pytest.raises(InputError, match=r"'2\.jpg' has another pose"), opened(full, moved(reduced)):
         pass
 
 
-def test_text_is_shown_as_it_is():
-    assert plain("a_b*<i>.jpg") == r"a\_b\*\<i\>\.jpg"
+def test_text_is_escaped():
+    assert plain_markdown("a_b*<i>.jpg") == r"a\_b\*\<i\>\.jpg"

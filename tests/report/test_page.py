@@ -11,15 +11,15 @@ from PIL import Image
 
 from slimsfm.errors import MapError, OutputError
 from slimsfm.report import report_html, write_report
-from slimsfm.report.budget import budget_for
-from slimsfm.report.jpegs import photo_uri
+from slimsfm.report.frames import photo_uri
+from slimsfm.report.report_data import report_budget
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 BYTES_PER_POINT = 20  # three floats and three bytes, as text
 
 
 class Reader(HTMLParser):
-    """Reads a page as a browser would, strictly: every tag must be closed in order."""
+    """Reads a page strictly: every tag must be closed in order."""
 
     def __init__(self, text):
         super().__init__()
@@ -57,7 +57,7 @@ def page(html):
     return Reader(html)
 
 
-def test_the_page_is_whole_and_has_every_part_of_every_object(page):
+def test_the_page_is_well_formed_and_has_every_section_of_every_object(page):
     assert page.tags.count("details") == page.tags.count("canvas") == 2
     assert "Exact scenes" in page.text
     for title in (
@@ -79,12 +79,13 @@ def test_only_the_first_object_is_open(html):
     ]
 
 
-def test_the_top_says_what_was_gained_and_what_that_cost(page):
-    story = page.text[: page.text.index("Objects")]
-    assert re.search(r"2 objects, 7 queries: the default map, direct, is \S+ smaller, \S+ \S+;", story)
-    assert re.search(r"ADD-0.1d 100.0 % → 71.4 %", story)
-    assert "95 % interval" in story
-    assert "p 0.5" in story
+def test_the_top_summarizes_gain_and_cost_and_defines_the_accuracy(page):
+    top = page.text[: page.text.index("Objects")]
+    assert re.search(r"2 objects, 7 queries: the default map, direct, is \S+ smaller, \S+ \S+;", top)
+    assert re.search(r"ADD-0.1d 100.0 % → 71.4 %", top)
+    assert top.index("box corners are off by less than 0.1 d") < top.index("Size of the map")
+    assert "95 % interval" in top
+    assert "p 0.5" in top
 
 
 def test_tables_hold_every_line_of_every_object_and_average(page, run):
@@ -97,13 +98,22 @@ def test_tables_hold_every_line_of_every_object_and_average(page, run):
     assert first[5:11] == ["100.0"] * 6
 
 
-def test_what_failed_stands_at_the_top_and_how_it_was_measured_at_the_bottom(page):
+def test_failed_objects_are_at_the_top_and_the_environment_is_at_the_bottom(page):
     assert page.text.index("1 object could not be measured") < page.text.index("Size of the map")
     assert "jug: there is no photo" in page.text
     end = page.text[page.text.index("How this was measured") :]
     assert "slimsfm benchmark exact -o run" in end
     assert "a <fast> one" in end
     assert "reduction.threshold0.05" in end
+
+
+def test_absolute_paths_are_not_shown(alone):
+    command = f"slimsfm benchmark exact {alone.folder} -o {alone.folder}/run"
+    options = {**alone.options, "command": command, "build": {"masks": str(alone.folder / "masks")}}
+    text = Reader(report_html(replace(alone, options=options))).text
+    assert "slimsfm benchmark exact run -o run" in text
+    assert "build.masksmasks" in text
+    assert str(alone.folder) not in text
 
 
 def test_the_page_fetches_nothing(html, page):
@@ -116,7 +126,7 @@ def test_the_page_fetches_nothing(html, page):
     assert "default-src 'none'" in html
 
 
-def test_a_run_without_objects_is_refused_and_leaves_what_is_there(run, tmp_path):
+def test_a_run_without_objects_is_refused_and_the_existing_file_stays(run, tmp_path):
     path = tmp_path / "report.html"
     path.write_text("mine")
     with pytest.raises(ValueError, match="at least one object"):
@@ -126,13 +136,13 @@ def test_a_run_without_objects_is_refused_and_leaves_what_is_there(run, tmp_path
 
 @pytest.fixture
 def alone(run, tmp_path):
-    """A run of one object, which a test may damage."""
+    """A run of one object that a test may damage."""
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mug"))
     return replace(run, folder=folder, objects=run.objects[:1])
 
 
-def test_one_object_needs_no_averages_and_what_is_there_stays_unless_overwriting(alone, tmp_path):
+def test_one_object_has_no_averages_and_an_existing_file_is_replaced_only_on_request(alone, tmp_path):
     path = tmp_path / "report.html"
     path.write_text("mine")
     with pytest.raises(OutputError, match="exists already"):
@@ -144,23 +154,23 @@ def test_one_object_needs_no_averages_and_what_is_there_stays_unless_overwriting
     assert "1 object, 3 queries" in text
 
 
-def test_methods_are_named_where_there_are_several(alone):
+def test_methods_are_named_if_there_are_several(alone):
     can = alone.objects[0]
     twice = replace(
         can, measurements=(*can.measurements, *(replace(cell, method="aliked") for cell in can.measurements))
     )
     text = Reader(report_html(replace(alone, objects=(twice,)))).text
     assert "the default map, direct, with sift, is" in text
-    assert "Maps and graph are those of sift." in text
+    assert "Maps and graph are from sift." in text
 
 
-def test_photos_that_are_gone_are_told_of_once(alone, tmp_path):
+def test_missing_photos_are_reported_once(alone, tmp_path):
     can = alone.objects[0]
     queries = tuple(replace(one, path=tmp_path / "gone" / one.path.name) for one in can.queries)
     moved = replace(can, images=tmp_path / "gone", queries=queries)
     html = report_html(replace(alone, objects=(moved,)))
     assert "data:image" not in html
-    assert html.count("The photos are not in") == html.count("The query images are not in") == 1
+    assert html.count("The photos are not available") == html.count("The query images are not available") == 1
     assert "<canvas" in html
 
 
@@ -170,11 +180,11 @@ def test_a_run_without_a_map_is_refused(alone):
         report_html(alone)
 
 
-def test_where_just_the_full_map_was_measured_nothing_is_compared(alone):
+def test_if_only_the_full_map_was_measured_nothing_is_compared(alone):
     can = alone.objects[0]
     full = replace(can, measurements=tuple(cell for cell in can.measurements if cell.variant == "full"))
     text = Reader(report_html(replace(alone, objects=(full,)))).text
-    assert "just the full map was measured" in text
+    assert "only the full map was measured" in text
     assert "Where it fails" not in text
 
 
@@ -182,7 +192,7 @@ def test_six_objects_of_sixty_photos_fit_into_fifteen_megabytes(html, run, tmp_p
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     photo = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
     Image.fromarray(photo).save(tmp_path / "photo.png")
-    limits = budget_for(6, 60)
+    limits = report_budget(6, 60)
     sizes = [
         len(photo_uri(tmp_path / "photo.png", side) or "") for side in (limits.photo_px, limits.frame_px)
     ]
@@ -192,8 +202,8 @@ def test_six_objects_of_sixty_photos_fit_into_fifteen_megabytes(html, run, tmp_p
 
 
 @pytest.mark.parametrize("references", [10, 60, 300, 3000])
-def test_the_more_there_is_the_less_is_shown_of_each(references):
-    few, many = budget_for(2, references), budget_for(100, references)
+def test_less_is_shown_of_each_of_many_objects(references):
+    few, many = report_budget(2, references), report_budget(100, references)
     assert few.points > many.points
     assert few.frames > many.frames
     assert few.photo_px >= many.photo_px

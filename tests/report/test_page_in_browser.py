@@ -1,4 +1,4 @@
-"""The page in a real browser: what is drawn, what moves, and that nothing is fetched."""
+"""The page in a browser: what it draws, how it reacts, and that it fetches nothing."""
 
 import numpy as np
 import pytest
@@ -47,34 +47,34 @@ def test_each_map_looks_different(page, variant):
     assert page.run(f"document.querySelector('#object-1 [data-show={variant}]').ariaPressed") == "true"
 
 
-def test_pointing_at_a_photo_tells_its_name_and_degrees_and_lights_up_its_edges(page):
+def test_pointing_at_a_photo_shows_its_name_and_degrees_and_highlights_its_edges(page):
     page.hover("#object-1 h2")
-    told = "document.querySelector('#object-1 .told').innerText"
-    assert "dominating set" in page.run(told)
+    described = "document.querySelector('#object-1 .details').innerText"
+    assert "dominating set" in page.run(described)
     page.hover(NODE)
     name = page.run(f"document.querySelector('{NODE}').dataset.name")
-    assert page.run(told).startswith(name)
-    assert "others, is localized by" in page.run(told)
+    assert page.run(described).startswith(name)
+    assert "others, is localized by" in page.run(described)
     assert page.run("document.querySelectorAll('#object-1 .edges .lit').length") > 0
-    assert page.run("document.querySelector('#object-1 .told img').naturalWidth") > 0
+    assert page.run("document.querySelector('#object-1 .details img').naturalWidth") > 0
     page.hover("#object-1 h2")
     assert page.run("document.querySelectorAll('#object-1 .edges .lit').length") == 0
 
 
-def test_a_photo_that_is_pointed_at_is_found_in_the_map(page):
+def test_pointing_at_a_photo_highlights_its_camera_in_the_map(page):
     page.hover("#object-1 h2")
     before = page.pixels(CANVAS)
     page.hover(NODE)
     assert np.any(before != page.pixels(CANVAS))
 
 
-def test_arrow_keys_walk_through_the_graph(page):
+def test_arrow_keys_move_through_the_graph(page):
     page.run("document.querySelector('#object-1 .node').focus()")
     visited = []
     for key in ("ArrowRight", "ArrowDown", "ArrowLeft", "ArrowUp"):
         page.press(key)
         visited.append(page.run("document.activeElement.dataset.name"))
-        assert page.run("document.querySelector('#object-1 .told').innerText").startswith(visited[-1])
+        assert page.run("document.querySelector('#object-1 .details').innerText").startswith(visited[-1])
     assert len(set(visited)) > 1
     page.run("document.activeElement.blur()")
 
@@ -92,7 +92,7 @@ def test_a_click_on_a_header_sorts_and_a_second_one_reverses(page):
     assert page.run(column) == sorted(points)
 
 
-def test_a_filter_leaves_the_rows_with_all_its_words(page):
+def test_a_filter_shows_the_rows_with_all_its_words(page):
     page.run("document.querySelector('.filter').value = 'direct FULL'")
     page.run("document.querySelector('.filter').dispatchEvent(new Event('input'))")
     rows = page.run(
@@ -111,7 +111,7 @@ def test_a_link_opens_the_section_of_its_object(page):
     assert colors(page.pixels("#object-2 canvas")) > 5
 
 
-def test_nothing_is_wider_than_a_phone(page):
+def test_the_page_fits_a_phone(page):
     page.resize(360, 740, mobile=True)
     assert page.run("document.documentElement.scrollWidth") <= 360
     page.resize(1200, 900)
@@ -127,7 +127,7 @@ def test_dark_looks_different(page):
     assert dark.mean() < 100
 
 
-def test_the_browser_has_nothing_to_complain_about_and_fetches_nothing(page):
+def test_the_page_logs_no_errors_and_fetches_nothing(page):
     assert page.complaints() == []
     assert [address for address in page.requests() if not address.startswith("file:")] == []
     assert len(page.requests()) == 1

@@ -15,7 +15,6 @@ from slimsfm.evaluation.result_files import write_results
 from slimsfm.evaluation.run import run_benchmark
 from slimsfm.execution import num_cores, processes
 from slimsfm.progress import shown
-from slimsfm.report import write_report
 
 _OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=32, query_frames=16)
 
@@ -29,6 +28,8 @@ def demo(
         output: Folder for the objects, the run with its maps and results.json, and report.html.
         overwrite: Replace the demo that is there.
     """
+    from slimsfm.report import write_report  # imports matplotlib
+
     watch = Stopwatch()
     if output.exists() and any(output.iterdir() if output.is_dir() else [output]) and not overwrite:
         raise OutputError(f"{output}: exists already; choose another output or pass --overwrite")

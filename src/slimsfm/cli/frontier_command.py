@@ -12,8 +12,8 @@ from slimsfm.files import replacing
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.reduction import FrontierOptions, frontier, recommend
-from slimsfm.report.curves import curves_figure
 from slimsfm.report.figures import check_figure, save_figure
+from slimsfm.report.tradeoffs import curves_figure
 
 
 def frontier_of(

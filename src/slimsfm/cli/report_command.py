@@ -10,7 +10,6 @@ from slimsfm.cli.output import OutputPath, Stopwatch, finish, parse
 from slimsfm.errors import InputError
 from slimsfm.evaluation.result_files import read_run
 from slimsfm.files import check_writable
-from slimsfm.report import write_report
 
 
 def report(
@@ -21,13 +20,15 @@ def report(
 ) -> None:
     """Show a run of `slimsfm benchmark` on one HTML page: what was kept, what it costs, where it fails.
 
-    The page needs no network and nothing beside it.
+    The page needs no network and no other file.
 
     Args:
         run: Folder of a run, with its maps.
-        output: The page.
-        overwrite: Replace what is there.
+        output: The HTML file.
+        overwrite: Replace an existing page.
     """
+    from slimsfm.report import write_report  # imports matplotlib
+
     watch = Stopwatch()
     check_writable(output, overwrite=overwrite)
     measured = read_run(run)

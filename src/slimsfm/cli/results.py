@@ -9,7 +9,7 @@ from slimsfm.evaluation.comparison import Comparison, DominationSummary
 from slimsfm.evaluation.formats import format_p_value, format_value, row_labels
 from slimsfm.evaluation.result_files import RunSummary
 from slimsfm.evaluation.table import BY_FRAME, Row, brief_columns, is_metric
-from slimsfm.report.formatting import plural, ratio
+from slimsfm.report.formatting import format_ratio, plural
 
 
 def print_summary(summary: RunSummary) -> None:
@@ -56,7 +56,10 @@ def print_rows(rows: Sequence[Row]) -> None:
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     """Print, row by row, what one map gains and loses against another."""
     for one in comparisons:
-        faster, smaller = ratio(one.faster, "faster", "slower"), ratio(one.smaller, "smaller", "larger")
+        faster, smaller = (
+            format_ratio(one.faster, "faster", "slower"),
+            format_ratio(one.smaller, "smaller", "larger"),
+        )
         console.print(
             f"{one.object}, {', '.join(one.after)} compared with {', '.join(one.before)}: {faster} in "
             f"matching and pose ({one.faster_between.low:.1f} to {one.faster_between.high:.1f}), {smaller}; "

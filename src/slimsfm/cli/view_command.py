@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 from time import sleep
+from typing import Annotated
 
-from slimsfm.cli.output import MapPath, console, parse
+from slimsfm.cli.networks import Networks
+from slimsfm.cli.output import Flat, MapPath, console, parse
 from slimsfm.errors import InputError
 from slimsfm.localization.cameras import FocalLength, read_camera
 from slimsfm.mapping.io import bytes_by_part, read_map
@@ -19,6 +21,7 @@ def view(
     queries: Path | None = None,
     camera: Path | None = None,
     focal: FocalLength = "known",
+    networks: Annotated[Networks, Flat] = Networks(),
     port: int = 8080,
     host: str = "localhost",
 ) -> None:
@@ -27,38 +30,38 @@ def view(
     Args:
         map: A map.
         reduced: A map that was reduced from it, to switch between the two.
-        images: Folder of the map's photos, to be shown where they were taken.
+        images: Folder of the map's photos, to show them in their cameras.
         queries: Folder of images to localize.
-        camera: Intrinsics of the queries, in COLMAP's cameras.txt format; else the map's or EXIF's.
+        camera: Intrinsics of the queries in COLMAP's cameras.txt format; default: the map's or EXIF's.
         focal: How well the queries' focal length is known.
-        port: Where the view is served; 0 is any free port.
-        host: Whom it is served: localhost is this machine alone, 0.0.0.0 all who can reach it.
+        networks: Where learned methods run.
+        port: Port of the view; 0 picks a free one.
+        host: Address of the view: localhost serves this machine only, 0.0.0.0 the whole network.
     """
     try:
-        from slimsfm.report.live import WeighedMap, live_view
-        from slimsfm.report.live_queries import QueryPanel
+        from slimsfm.report.live import LiveQueries, MapWithSize, live_view
     except ModuleNotFoundError as error:
         raise InputError(
             f"view needs {error.name}, which is not installed: pip install 'slimsfm[view]'"
         ) from error
+    networks.apply()
     if images and not images.is_dir():
         raise InputError(f"{images}: no such folder of images")
     given = read_camera(camera) if camera else None
+    asked = LiveQueries(folder=queries, camera=given, focal=focal) if queries else None
     paths = [map, reduced] if reduced else [map]
-    maps = [WeighedMap(map=read_map(path), num_bytes=bytes_by_part(path)["total"]) for path in paths]
-    with live_view(*maps, host=host, port=port) as live:
-        if queries:
-            QueryPanel(live, queries, given, focal)
-        console.print(f"{live.address} shows {' and '.join(str(path) for path in paths)}; Ctrl-C ends it")
-        if images:
-            missing = live.show_photos(images, shown)
-            if missing:
-                console.print(
-                    f"{images}: {missing} of {len(live.frustums)} photos are missing or unreadable",
-                    style="yellow",
-                )
-        while True:
-            sleep(3600)
+    maps = [MapWithSize(map=read_map(path), num_bytes=bytes_by_part(path)["total"]) for path in paths]
+    try:
+        with live_view(*maps, queries=asked, host=host, port=port) as live:
+            names = " and ".join(str(path) for path in paths)
+            console.print(f"{live.address} shows {names}; Ctrl-C stops it")
+            if images and (missing := live.show_photos(images, shown)):
+                count = f"{missing} of {len(live.scene.frusta)}"
+                console.print(f"{images}: {count} photos are missing or unreadable", style="yellow")
+            while True:
+                sleep(3600)
+    except KeyboardInterrupt:
+        print("stopped")  # rich would repeat a line whose printing was interrupted
 
 
 def main(arguments: Sequence[str]) -> None:

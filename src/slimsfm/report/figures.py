@@ -1,6 +1,6 @@
-"""Figures by matplotlib: how they look, as part of a page, and as files.
+"""Style of matplotlib figures, and writing them into a page or a file.
 
-Matplotlib's settings are changed for a moment only, and equal figures give equal bytes.
+Matplotlib's settings change only within these functions. Equal figures give equal bytes.
 """
 
 import re
@@ -22,22 +22,28 @@ from slimsfm.errors import OutputError
 from slimsfm.files import replacing
 
 INK = "#1c1d21"
-"""Colour of text and axes; on the page whatever colour its text has."""
+"""Color of text and axes; on the page it becomes the color of the page's text."""
 
 PAPER = "#fefefe"
-"""Colour of what is to look cut out; on the page its background."""
+"""Color that looks like the background; on the page it becomes the page's background."""
 
 COLORS = ("#1f7fb0", "#d9660a", "#3d9040", "#9160ba", "#a08000", "#c2448f", "#6b7684")
-"""Colours of kinds of things, to be told apart on light and on dark ground."""
+"""Colors of categories, distinguishable on light and dark backgrounds."""
 
 CHOSEN = "#d6231f"
-"""Colour of the images that are kept."""
+"""Color of images that are kept."""
 
 DROPPED = "#8a8d96"
-"""Colour of the images that are dropped."""
+"""Color of images that are dropped."""
 
-FORMATS = (".svg", ".png", ".pdf")
-"""Suffixes of the files that figures are written as."""
+BOX_COLOR = "#2268d8"
+"""Color of the object's box."""
+
+RIGHT_COLOR = "#12873a"
+"""Color of queries that are localized correctly."""
+
+FIGURE_FORMATS = (".svg", ".png", ".pdf")
+"""Suffixes of the supported file formats."""
 
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -52,7 +58,7 @@ _STYLE: dict[Any, Any] = {
     "figure.facecolor": "none",
     "legend.frameon": False,
     "legend.fontsize": 8.0,
-    "text.parse_math": False,  # a dollar is a dollar
+    "text.parse_math": False,  # a dollar sign is text
     "grid.alpha": 0.14,
     "grid.linewidth": 0.7,
     "text.color": INK,
@@ -65,12 +71,12 @@ _STYLE: dict[Any, Any] = {
     "patch.edgecolor": INK,
 }
 _WRITING: dict[Any, Any] = {
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib, so that layouts are equal everywhere
+    "font.sans-serif": ["DejaVu Sans"],  # part of matplotlib, so that layouts are equal everywhere
     "svg.fonttype": "none",
     "svg.hashsalt": "slimsfm",
     "pdf.fonttype": 42,
 }
-_DPI = 160  # of files of pixels, and of the pixels in others
+_DPI = 160  # of PNG files, and of rasterized parts of the others
 _NO_DATE: dict[str, dict[str, None]] = {
     "svg": {"Date": None, "Creator": None},
     "png": {"Software": None},
@@ -82,28 +88,28 @@ _FONTS = "system-ui, sans-serif"  # on the page
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Figures that are made within look like all others."""
+    """Apply the common style to figures made within the context."""
     with mpl.rc_context(_STYLE):
         yield
 
 
 def new_figure(width: float, height: float, label: str) -> Figure:
-    """An empty figure, to be filled within `styled`.
+    """Make an empty figure; draw into it within `styled`.
 
     Args:
         width: In inches.
         height: In inches.
-        label: What it shows, for those who cannot see it.
+        label: Alternative text.
     """
     return Figure(figsize=(width, height), layout="compressed", label=label)
 
 
 def mark_logarithmic(axis: Axis, write: Callable[[float], str]) -> None:
-    """Put marks at powers of ten on a logarithmic axis, and at their double and fivefold where there is room.
+    """Put ticks at powers of ten on a logarithmic axis, and on short axes at 2 and 5 times these, too.
 
     Args:
         axis: Its limits must be final.
-        write: Makes the words at a mark.
+        write: Formats the value of a tick.
     """
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if log10(high / low) < _FEW_DECADES else (1.0,)))
@@ -115,8 +121,8 @@ def mark_logarithmic(axis: Axis, write: Callable[[float], str]) -> None:
 def figure_svg(figure: Figure) -> str:
     """The figure as an SVG element for an HTML page.
 
-    Its ground is transparent, `INK` becomes the colour of the page's text and `PAPER` the page's ground, text
-    stays text, and ids are those of no other figure.
+    The background is transparent, `INK` becomes the color of the page's text and `PAPER` the page's
+    background. Text stays text, and ids are unique to the figure.
     """
     text = _svg(figure, transparent=True)
     text = text[text.index("<svg") :]
@@ -135,7 +141,7 @@ def _svg(figure: Figure, *, transparent: bool) -> str:
 
 
 def _with_own_ids(text: str) -> str:
-    """Drop ids that nothing refers to, and put the others' names apart from those of other figures."""
+    """Drop unused ids, and make the others unique to the figure."""
     digest = sha256(text.encode()).hexdigest()[:8]
     used = set(re.findall(r"(?:url\(#|href=\"#)([^)\"]+)", text))
 
@@ -147,7 +153,7 @@ def _with_own_ids(text: str) -> str:
 
 
 def _with_head(text: str, figure: Figure) -> str:
-    """Put what the element is and how wide it may grow into its tag."""
+    """Replace the tag of the element by one with alternative text and a maximum width."""
     width, height = (72 * side for side in figure.get_size_inches())
     head = (
         f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{escape(str(figure.get_label()))}" '
@@ -159,21 +165,21 @@ def _with_head(text: str, figure: Figure) -> str:
 
 
 def check_figure(path: Path) -> None:
-    """Refuse, before any work is done, a file that no figure can be written as.
+    """Check the file format of a figure before any work is done.
 
     Raises:
-        OutputError: Its suffix is of no format.
+        OutputError: The suffix is not a supported format.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise OutputError(f"{path}: figures are written as {', '.join(FORMATS)}")
+    if path.suffix.lower() not in FIGURE_FORMATS:
+        raise OutputError(f"{path}: not a supported figure format ({', '.join(FIGURE_FORMATS)})")
 
 
 def save_figure(figure: Figure, path: Path, *, overwrite: bool = False) -> None:
-    """Write a figure, on white, in the format that the suffix tells.
+    """Write a figure on white, in the format of the file's suffix.
 
     Raises:
-        OutputError: The suffix is of no format, or the file exists and `overwrite` is off, or it cannot be
-            written.
+        OutputError: The suffix is not a supported format, the file exists and `overwrite` is off, or it
+            cannot be written.
     """
     check_figure(path)
     kind = path.suffix.lower()[1:]

@@ -1,31 +1,36 @@
-"""Query images with the object's box drawn in, estimated and true."""
+"""Query images with the estimated and the true box drawn in, and JPEGs embedded in the page."""
 
+import base64
+import io
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 from jaxtyping import Float64
+from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
+from slimsfm.errors import ImageError
 from slimsfm.geometry import BOX_EDGES, Box, project
-from slimsfm.report.jpegs import jpeg_uri
+from slimsfm.photos import read_image, shrink
 
 ESTIMATED_RGB = (235, 45, 40)
-"""Colour of the box under the estimated pose."""
+"""Color of the box at the estimated pose."""
 
 TRUE_RGB = (30, 200, 70)
-"""Colour of the box under the true pose."""
+"""Color of the box at the true pose."""
 
-_SAMPLES = 33  # points an edge is drawn through: distortion bends it
-_NEAR = 1e-3  # depth, over the box's diagonal, at which edges are cut
+_SAMPLES = 33  # points per edge, which distortion bends
+_NEAR = 1e-3  # depth at which edges are clipped, relative to the box's diagonal
 _SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class QueryFrame:
-    """A query image and where its camera was thought to stand."""
+    """A query image with its estimated and true pose."""
 
     image: Image
     """Upright RGB."""
@@ -34,27 +39,27 @@ class QueryFrame:
     """Intrinsics of the image."""
 
     estimated_cam_from_world: pycolmap.Rigid3d | None
-    """None where the query could not be localized."""
+    """None if the query was not localized."""
 
     true_cam_from_world: pycolmap.Rigid3d
-    """Where it truly stood."""
+    """The true pose."""
 
     label: str
-    """Name of the frame."""
+    """Name of the image."""
 
     verdict: str
-    """What became of it."""
+    """Outcome of the query, for the caption."""
 
     def __post_init__(self) -> None:
         if (self.camera.width, self.camera.height) != self.image.shape[1::-1]:
             raise ValueError(
-                f"camera is of {self.camera.width}x{self.camera.height} pixels, the image of "
+                f"camera has {self.camera.width}x{self.camera.height} pixels, the image "
                 f"{self.image.shape[1]}x{self.image.shape[0]}"
             )
 
 
 def frame_html(frame: QueryFrame, box: Box, max_size: int) -> str:
-    """The frame as a figure whose image is part of the page."""
+    """The frame as an HTML figure with an embedded image."""
     label = escape(frame.label)
     uri = jpeg_uri(draw_frame(frame, box, max_size), thin_lines=True)
     return (
@@ -64,15 +69,15 @@ def frame_html(frame: QueryFrame, box: Box, max_size: int) -> str:
 
 
 def draw_frame(frame: QueryFrame, box: Box, max_size: int) -> Image:
-    """The image, at most so many pixels long, with the true box in green and the estimated in red."""
+    """The image, at most `max_size` pixels long, with the true box in green and the estimated one in red."""
     height, width = frame.image.shape[:2]
     scale = min(1.0, max_size / max(height, width))
     camera = pycolmap.Camera(frame.camera.todict())
     camera.rescale(max(1, round(width * scale)), max(1, round(height * scale)))
     size = (camera.width, camera.height)
     drawn = np.ascontiguousarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
-    # the true box is the thicker, so that it shows where the two coincide
-    draw_box(drawn, box, frame.true_cam_from_world, camera, TRUE_RGB, thickness=5)
+    # the true box is thicker, so that it shows where the two coincide
+    draw_box(drawn, box, frame.true_cam_from_world, camera, TRUE_RGB, thickness=4)
     if frame.estimated_cam_from_world is not None:
         draw_box(drawn, box, frame.estimated_cam_from_world, camera, ESTIMATED_RGB, thickness=2)
     return drawn
@@ -87,7 +92,7 @@ def draw_box(
     *,
     thickness: int,
 ) -> None:
-    """Draw the edges of a box into an image, as a camera sees them under a pose."""
+    """Draw the edges of a box into an image, as a camera with this pose sees them."""
     for i, j in BOX_EDGES:
         edge = cam_from_world * box.corners[[i, j]]
         clipped = _before_camera(edge, _NEAR * box.diagonal)
@@ -96,7 +101,7 @@ def draw_box(
 
 
 def _before_camera(edge_in_cam: Float64[np.ndarray, "2 3"], near: float) -> Float64[np.ndarray, "2 3"] | None:
-    """The part of an edge that lies before the camera, or None."""
+    """The part of an edge in front of the camera, or None."""
     near_end, far_end = edge_in_cam[np.argsort(edge_in_cam[:, 2])]
     if far_end[2] <= near:
         return None
@@ -107,10 +112,10 @@ def _before_camera(edge_in_cam: Float64[np.ndarray, "2 3"], near: float) -> Floa
 
 
 def _bent(edge_in_cam: Float64[np.ndarray, "2 3"], camera: pycolmap.Camera) -> Float64[np.ndarray, "n 2"]:
-    """Where an edge runs in the image, in pixels; NaN where the camera's distortion does not reach.
+    """Pixel positions along an edge; NaN where the distortion model is not invertible.
 
-    Far outside the image a distortion polynomial turns back and would put points into it: those do not come
-    back to their ray when the distortion is undone.
+    Far outside the image a distortion polynomial folds back into it. Undistorting such a pixel does not
+    return its ray.
     """
     shares = np.linspace(0, 1, _SAMPLES)[:, None]
     points = edge_in_cam[0] + shares * (edge_in_cam[1] - edge_in_cam[0])
@@ -123,11 +128,32 @@ def _bent(edge_in_cam: Float64[np.ndarray, "2 3"], camera: pycolmap.Camera) -> F
 
 
 def _draw_polyline(image: Image, points2D: Float64[np.ndarray, "n 2"], color: tuple, thickness: int) -> None:
-    """Draw what lies in or near the image; OpenCV takes no coordinates of any size."""
+    """Draw the parts in or near the image; OpenCV does not accept arbitrarily large coordinates."""
     reach = 4 * max(image.shape)
-    pixels = points2D - 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
+    pixels = points2D - 0.5  # OpenCV puts the center of the top-left pixel at (0, 0)
     usable = np.all(np.abs(np.nan_to_num(pixels, nan=np.inf)) < reach, axis=1)
     whole = np.rint(np.where(usable[:, None], pixels, 0) * 2**_SUBPIXEL_BITS).astype(int)
     for k in np.flatnonzero(usable[:-1] & usable[1:]):
         ends = whole[k].tolist(), whole[k + 1].tolist()
         cv2.line(image, *ends, color, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def jpeg_uri(image: Image, *, thin_lines: bool) -> str:
+    """An image as a data URI.
+
+    Args:
+        image: RGB.
+        thin_lines: Keep the colors of thin lines, for about 50 % more bytes.
+    """
+    buffer = io.BytesIO()
+    quality, subsampling = (80, "4:4:4") if thin_lines else (75, "4:2:0")
+    PillowImage.fromarray(image).save(buffer, "JPEG", quality=quality, subsampling=subsampling, optimize=True)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def photo_uri(path: Path, max_size: int) -> str | None:
+    """A photo as a data URI, its longer side at most `max_size` pixels; None if it cannot be read."""
+    try:
+        return jpeg_uri(shrink(read_image(path), max_size), thin_lines=False)
+    except ImageError:
+        return None

@@ -1,12 +1,13 @@
 "use strict";
-// Pointing at a node of a reference graph, tapping it or walking there with arrow keys lights up its edges and its
-// camera in the 3D view, and tells of it.
+// Pointing at a node of a reference graph, tapping it or moving there with arrow keys highlights its edges and its
+// camera in the 3D view, and describes it.
 
 for (const graph of document.querySelectorAll(".graph")) {
   const drawing = graph.querySelector("svg"), nodes = [...graph.querySelectorAll(".node")];
-  const told = graph.querySelector(".told"), photo = told.querySelector("img"), text = told.querySelector("p");
+  const details = graph.querySelector(".details"), photo = details.querySelector("img");
+  const text = details.querySelector("p");
   const edges = [...graph.querySelectorAll(".edges path")], legend = text.innerHTML;
-  const middles = nodes.map(node => {
+  const centers = nodes.map(node => {
     const frame = node.querySelector("rect"), value = name => Number(frame.getAttribute(name));
     return { x: value("x") + value("width") / 2, y: value("y") + value("height") / 2, reach: value("width") };
   });
@@ -23,11 +24,11 @@ for (const graph of document.querySelectorAll(".graph")) {
     }
     drawing.classList.toggle("pointed", index !== null);
     nodes.forEach((node, k) => node.classList.toggle("lit", near.has(k)));
-    tell(index);
+    describe(index);
     graph.parentElement.dispatchEvent(new CustomEvent("image", { detail: index }));
   }
 
-  function tell(index) {
+  function describe(index) {
     const source = index === null ? null : nodes[index].querySelector("image");
     photo.hidden = !source;
     if (source) photo.src = source.getAttribute("href");
@@ -37,20 +38,20 @@ for (const graph of document.querySelectorAll(".graph")) {
     text.replaceChildren(title, nodes[index].getAttribute("aria-label").slice(name.length));
   }
 
-  // The node under a pointer, or near enough to be meant by a finger.
+  // The node under a pointer, or close enough to a finger.
   function under(event) {
     const hit = nodes.indexOf(event.target.closest(".node"));
     if (hit >= 0) return hit;
     const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(drawing.getScreenCTM().inverse());
-    const gaps = middles.map(({ x, y }) => Math.hypot(x - at.x, y - at.y));
+    const gaps = centers.map(({ x, y }) => Math.hypot(x - at.x, y - at.y));
     const best = gaps.indexOf(Math.min(...gaps));
-    return gaps[best] < middles[best].reach ? best : null;
+    return gaps[best] < centers[best].reach ? best : null;
   }
 
   // The nearest node in the direction of an arrow key.
-  function beside(index, dx, dy) {
-    const { x, y } = middles[index];
-    const costs = middles.map((other, k) => {
+  function neighbor(index, dx, dy) {
+    const { x, y } = centers[index];
+    const costs = centers.map((other, k) => {
       const along = (other.x - x) * dx + (other.y - y) * dy, across = Math.abs((other.x - x) * dy + (other.y - y) * dx);
       return k === index || along <= across / 2 ? Infinity : along + 2 * across;
     });
@@ -77,7 +78,7 @@ for (const graph of document.querySelectorAll(".graph")) {
     node.addEventListener("keydown", event => {
       if (!(event.key in ways)) return;
       event.preventDefault();
-      focus(beside(index, ...ways[event.key]));
+      focus(neighbor(index, ...ways[event.key]));
     });
   });
 }

@@ -1,5 +1,5 @@
 "use strict";
-// A link to an object opens its section; on paper all sections are open.
+// A link to an object opens its section; in print all sections are open.
 function reveal() {
   const target = location.hash && document.getElementById(location.hash.slice(1));
   if (!target) return;

@@ -1,6 +1,6 @@
 "use strict";
-// A click on a header sorts its table: numbers largest first, text alphabetically, a second click reversed.
-// A filter above a table leaves the rows that hold all its words.
+// A click on a header sorts its table: numbers in descending order, text alphabetically; a second click reverses it.
+// A filter above a table shows the rows that contain all its words.
 for (const table of document.querySelectorAll("table")) {
   const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
   heads.forEach((head, column) => head.addEventListener("click", () => {
@@ -25,7 +25,7 @@ for (const table of document.querySelectorAll("table")) {
 
 function compare(a, b, numeric, sign) {
   if (!numeric) return a.textContent.localeCompare(b.textContent);
-  const missing = sign * Infinity; // a dash comes last either way
+  const missing = sign * Infinity; // a dash comes last in both orders
   const x = "value" in a.dataset ? Number(a.dataset.value) : missing;
   const y = "value" in b.dataset ? Number(b.dataset.value) : missing;
   return x === y ? 0 : x < y ? -1 : 1;

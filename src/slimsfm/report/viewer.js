@@ -1,18 +1,18 @@
 "use strict";
 // Draws a map in 3D on a plain canvas: points through a depth buffer, then images and box as lines.
-// The frame: origin in the box's centre, z up, unit the box's diagonal.
-// A map is shown once its section is open; until then its data stay text.
+// The frame: origin at the box's center, z up, unit the box's diagonal.
+// A map is decoded when its section is opened.
 
-const FOCAL = 1.3;   // over the canvas's shorter side
+const FOCAL = 1.3;   // relative to the canvas's shorter side
 const NEAR = 0.02;
-const FEW = 3000;    // points, and fewer, are drawn larger
+const FEW = 3000;    // this many points or fewer are drawn larger
 
 function decode(text, Type) {
   const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
   return new Type(bytes.buffer);
 }
 
-// Where the eye is, as a function that gives right, down and depth of a point.
+// Axes and position of the eye.
 function eye(state) {
   const cy = Math.cos(state.yaw), sy = Math.sin(state.yaw);
   const cp = Math.cos(state.pitch), sp = Math.sin(state.pitch);
@@ -47,7 +47,7 @@ function drawPoints(context, width, height, view, focal, map, dot) {
   context.putImageData(picture, 0, 0);
 }
 
-// Adds a line to the current path, cut where it passes behind the eye.
+// Adds a line to the current path, clipped in front of the eye.
 function line(context, width, height, view, focal, from, to) {
   const seen = [from, to].map(point => {
     const dot = axis => axis[0] * point[0] + axis[1] * point[1] + axis[2] * point[2];
@@ -65,7 +65,7 @@ function line(context, width, height, view, focal, from, to) {
   context.lineTo(...place(seen[1]));
 }
 
-// The distance from which, and the shift by which, the box and all images just fill the picture.
+// Distance and shift of the eye with which the box and all images fill the picture.
 function fit(canvas, scene, state) {
   const { right, down, back } = eye(state), focal = FOCAL * Math.min(canvas.clientWidth, canvas.clientHeight);
   const dot = (axis, point) => axis[0] * point[0] + axis[1] * point[1] + axis[2] * point[2];
@@ -105,18 +105,18 @@ function draw(canvas, scene, state) {
     context.stroke();
     context.globalAlpha = 1;
   };
-  const frustums = images => images.map(k => scene.images[k]).flatMap(
+  const frusta = images => images.map(k => scene.images[k]).flatMap(
     ([o, a, b, c, d]) => [[o, a], [o, b], [o, c], [o, d], [a, b], [b, c], [c, d], [d, a]]);
   lines("--box", 1.5, 0.9, scene.edges.map(([i, j]) => [scene.box[i], scene.box[j]]));
-  lines("--dropped", 1, 0.7, frustums(map.images.filter(k => !scene.chosen[k])));
-  lines("--chosen", 1.8, 1, frustums(map.images.filter(k => scene.chosen[k])));
-  if (state.lit !== null) lines("--ink", 3.5, 1, frustums([state.lit]));
+  lines("--dropped", 1, 0.7, frusta(map.images.filter(k => !scene.chosen[k])));
+  lines("--chosen", 1.8, 1, frusta(map.images.filter(k => scene.chosen[k])));
+  if (state.lit !== null) lines("--ink", 3.5, 1, frusta([state.lit]));
 }
 
-// Drag turns, two fingers or the wheel zoom, arrow keys and + - do the same.
+// Dragging turns, two fingers or the wheel zoom; so do arrow keys, + and -.
 function listen(canvas, state, reset, redraw) {
   const fingers = new Map();
-  const spread = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
+  const pinch = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
   const turn = (yaw, pitch) => {
     state.moved = true;
     state.yaw += yaw;
@@ -135,9 +135,9 @@ function listen(canvas, state, reset, redraw) {
   canvas.addEventListener("pointermove", event => {
     const last = fingers.get(event.pointerId);
     if (!last) return;
-    const before = fingers.size === 2 ? spread() : 0;
+    const before = fingers.size === 2 ? pinch() : 0;
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-    if (fingers.size === 2) zoom(before / Math.max(1, spread()));
+    if (fingers.size === 2) zoom(before / Math.max(1, pinch()));
     else turn((last.x - event.clientX) / 150, (event.clientY - last.y) / 150);
   });
   for (const end of ["pointerup", "pointercancel"]) {
