@@ -28,7 +28,7 @@ TWIN_FROM_OBJECT = pycolmap.Rigid3d(
 )
 """Pose of the twin: the motion from the object to it."""
 
-_TEXELS_PER_METRE = 2500
+_TEXELS_PER_METER = 2500
 _WALLS = 0.8  # meters from the object to the walls
 _ROOM = (-115.0, 25.0)  # azimuths in degrees from which a camera sees the object in front of a wall
 _MAPPING, _QUERY = 0, 1
@@ -202,7 +202,7 @@ def _take(scene: Scene, camera: pycolmap.Camera, poses: list[pycolmap.Rigid3d], 
 
 
 def _tile(rng: np.random.Generator, period: float) -> Picture:
-    edge = round(period * _TEXELS_PER_METRE)
+    edge = round(period * _TEXELS_PER_METER)
     return texture.page(rng, edge, edge, cell=edge // 2) // 2 + 70
 
 

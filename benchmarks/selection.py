@@ -63,7 +63,7 @@ class Result:
     add: tuple[float, float, float]
     median: float
     ms: float
-    foretold: float | None
+    predicted: float | None
 
 
 def main() -> None:
@@ -122,8 +122,8 @@ def image_sets(scene: Scene, slim: Path) -> Iterator[Result]:
             chosen = dominating_set(graph, DominatingSetOptions(seed=seed, **options), full).chosen
             images = [graph.names[i] for i in chosen]
             made = stored(keep_images(full, images), slim)
-            foretold = trials.images(images)
-            yield tried(scene, *made, name, "exhaustive", foretold, seed=seed)
+            predicted = trials.images(images)
+            yield tried(scene, *made, name, "exhaustive", predicted, seed=seed)
             yield tried(scene, *made, name, "direct", seed=seed)
 
 
@@ -139,7 +139,7 @@ def tried(
     size: int,
     method: str,
     strategy: str,
-    foretold: Prediction | None = None,
+    predicted: Prediction | None = None,
     seed: int = 0,
 ) -> Result:
     """Localize all queries of a scene."""
@@ -156,17 +156,17 @@ def tried(
         add=tuple(scores.add.values()),
         median=scores.median_error,
         ms=1e3 * (seconds.match + seconds.pose),
-        foretold=foretold.within(0.1) if foretold and foretold.tests else None,
+        predicted=predicted.within(0.1) if predicted and predicted.tests else None,
     )
 
 
 def line(one: Result) -> str:
     """One row of the table."""
     shares = " ".join(f"{share:5.1f}" for share in one.add)
-    foretold = "" if one.foretold is None else f"  foretold {one.foretold:.1f}"
+    predicted = "" if one.predicted is None else f"  predicted {one.predicted:.1f}"
     return (
         f"{one.scene:12} {one.method:14} {one.strategy:10} {one.images:3d} images {one.points:6d} points "
-        f"{one.bytes / 1000:8.0f} kB  {shares}  {1e3 * one.median:7.2f}e-3d {one.ms:8.2f} ms{foretold}"
+        f"{one.bytes / 1000:8.0f} kB  {shares}  {1e3 * one.median:7.2f}e-3d {one.ms:8.2f} ms{predicted}"
     )
 
 
@@ -186,10 +186,10 @@ def sum_up(results: list[Result]) -> None:
             f"{full[name].bytes / default[name].bytes:5.0f}x smaller, {default[name].points:5d} points, "
             f"lost {lost[0]:5.1f} {lost[1]:5.1f} {lost[2]:5.1f} (targets 0.5 0.5 1)"
         )
-    foretold = [one for one in results if one.foretold is not None]
-    for method in dict.fromkeys(one.method for one in foretold):
-        off = np.mean([abs(one.foretold - one.add[0]) for one in foretold if one.method == method])
-        print(f"foretold against true share within 0.1 d, {method}: {off:.1f} points off (target 3)")
+    predicted = [one for one in results if one.predicted is not None]
+    for method in dict.fromkeys(one.method for one in predicted):
+        off = np.mean([abs(one.predicted - one.add[0]) for one in predicted if one.method == method])
+        print(f"predicted against true share within 0.1 d, {method}: {off:.1f} points off (target 3)")
     if any(one.method == "kcover" for one in results):
         share_of_points(results, names)
 

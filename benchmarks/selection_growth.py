@@ -22,7 +22,7 @@ from slimsfm.selection import SELECTORS, SelectionProblem
 POINTS_AN_IMAGE = 100  # points over images, each seen by ten
 REACH = 10.0  # images to either side, the standard deviation of where a point is seen from
 FOCAL_PX = 1000.0
-DIAGONAL = 20.0  # of the box, metres
+DIAGONAL = 20.0  # of the box, in meters
 MAX_SECONDS, MAX_GIB = 600, 8
 
 

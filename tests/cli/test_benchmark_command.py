@@ -96,7 +96,10 @@ def test_photos_give_their_own_truth(boulder, tmp_path):
     truth = read_map(output / "truth" / "photos" / "pseudo-ground-truth")
     assert [query.path.name for query in result.queries] == list(truth.images)[::4]
     assert not set(full.images) & {query.path.name for query in result.queries}
-    assert "n°-n cm: not given" in done.out
+    assert "n°-n cm: not available" in done.out
+    assert "1 object, 3 queries" in done.out
+    assert "1 objects" not in done.out
+    assert "sift: dominating sets of 1 image;" in done.out
 
 
 def test_two_runs_are_compared_line_by_line(synthetic, boulder, tmp_path):
@@ -108,7 +111,7 @@ def test_two_runs_are_compared_line_by_line(synthetic, boulder, tmp_path):
     compared = slimsfm("benchmark", "--compare", folder / "results.json", other)
     assert compared.code == 0, compared.err
     (line,) = compared.out.splitlines()
-    assert line.startswith(f"{NAME}, sift, direct, full: ")
+    assert line.startswith(f"{NAME}, sift, direct, full compared with sift, direct, full: ")
     assert "ADD-0.1d 100.0 -> 100.0 (+0.0 to +0.0, p 1.000)" in line
     alone = slimsfm("benchmark", "--compare", folder)
     assert (alone.code, "takes two runs" in alone.err) == (2, True)

@@ -29,13 +29,13 @@ class Known:
     """An object that every layout is to hold."""
 
     box: Box
-    """In metres, off the origin."""
+    """In meters, off the origin."""
 
     vertices: np.ndarray
-    """Of its model, in metres; the corners of the box are among them."""
+    """Of its model, in meters; the corners of the box are among them."""
 
     poses: tuple[pycolmap.Rigid3d, ...]
-    """Where the camera stood, in metres."""
+    """Where the camera stood, in meters."""
 
     def matrix(self, number: int) -> np.ndarray:
         """One of the poses, 4x4."""

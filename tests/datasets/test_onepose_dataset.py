@@ -170,10 +170,10 @@ def assert_same_colors_where_points_project(map_, full, cropped):
     inside = np.all((pixels[1] > 8) & (pixels[1] < 503), axis=1)
     assert inside.sum() > 20
     of_frame = sampled(frame, pixels[0][inside])
-    here, *beside = (
+    here, *neighbors = (
         np.abs(sampled(crop, pixels[1][inside] + shift) - of_frame).mean() for shift in (0.0, -0.5, 0.5)
     )
-    assert here < 0.7 * min(beside)
+    assert here < 0.7 * min(neighbors)
 
 
 def sampled(image, pixels):

@@ -174,14 +174,14 @@ def test_errors_are_relative_to_the_diameter_of_the_model():
 def test_no_pose_is_infinitely_wrong_and_counts_as_failure(model):
     assert pose_error(None, rigid(), BOX, model) is NO_POSE
     errors = [pose_error(pose, rigid(), BOX, model) for pose in (None, rigid(), rigid(), None)]
-    relative, degrees, metres = (
+    relative, degrees, meters = (
         np.array([getattr(one, name) for one in errors])
         for name in ("relative", "rotation_deg", "translation")
     )
     for fraction in (0.1, 1.0, 1e9):
         assert add_percent(relative, fraction) == 50.0
-    assert deg_cm_percent(degrees, metres, 5) == 50.0
-    assert within_deg_cm(degrees, metres, 180).tolist() == [False, True, True, False]
+    assert deg_cm_percent(degrees, meters, 5) == 50.0
+    assert within_deg_cm(degrees, meters, 180).tolist() == [False, True, True, False]
 
 
 def test_add_counts_errors_strictly_below_the_fraction():
@@ -190,7 +190,7 @@ def test_add_counts_errors_strictly_below_the_fraction():
 
 
 @pytest.mark.parametrize(
-    ("deg", "metres", "expected"),
+    ("deg", "meters", "expected"),
     [
         (1.0, 0.01, 100.0),
         (1.0001, 0.01, 0.0),
@@ -200,8 +200,8 @@ def test_add_counts_errors_strictly_below_the_fraction():
         (3.0, 0.002, 0.0),
     ],
 )
-def test_degrees_and_centimeters_must_both_be_within(deg, metres, expected):
-    assert deg_cm_percent(np.array([deg]), np.array([metres]), 1) == expected
+def test_degrees_and_centimeters_must_both_be_within(deg, meters, expected):
+    assert deg_cm_percent(np.array([deg]), np.array([meters]), 1) == expected
 
 
 @pytest.mark.parametrize("n", [1, 3, 5])

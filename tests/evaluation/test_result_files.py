@@ -202,7 +202,7 @@ DAMAGE = {
     "a flat box": put([[0, 0, 0]] * 3, "objects", 0, "box", "half_edges"),
     "words for numbers": put(["good"] * QUERIES, *TRIAL, "error"),
     "an unknown camera": put("PINHOLE_9", "objects", 0, "queries", 0, "camera", "model"),
-    "another field": put(1, "objects", 0, "maps", 0, "colour"),
+    "another field": put(1, "objects", 0, "maps", 0, "color"),
 }
 
 

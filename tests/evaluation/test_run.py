@@ -59,7 +59,7 @@ def break_object(dataset, name, how):
     (dataset.path / name / "broken").write_text(how)
 
 
-def mend(dataset, name):
+def repair(dataset, name):
     (dataset.path / name / "broken").unlink()
 
 
@@ -135,7 +135,7 @@ def test_a_run_that_is_interrupted_repeatedly_has_the_same_result(whole, breakab
     break_object(breakable, "mug", "interrupt")
     with pytest.raises(KeyboardInterrupt):
         run_benchmark(breakable, bench_in(folder))
-    mend(breakable, "mug")
+    repair(breakable, "mug")
     done = state_of(folder, "can")
     for stage in ("localize 7 pairs", "find usable points"):
         with pytest.raises(KeyboardInterrupt):
@@ -176,7 +176,7 @@ def test_broken_objects_do_not_stop_others_and_are_tried_again(whole, breakable,
     assert [path.name for path in (folder / "objects").iterdir()] == ["mug.json"]
     done = state_of(folder, "mug")
     assert run_benchmark(breakable, bench_in(folder)).failed == run.failed
-    mend(breakable, "can")
+    repair(breakable, "can")
     run = run_benchmark(breakable, bench_in(folder))
     assert list(run.failed) == ["jar"]
     assert_equal_runs(replace(run, failed={}), whole)
@@ -286,9 +286,9 @@ def test_leftovers_of_a_killed_process_are_ignored(dataset, tmp_path):
 
 
 def test_maps_of_an_object_that_failed_are_not_used_again(breakable, tmp_path):
-    told = breakable.path / NAMES[0] / "object.json"
-    gone = json.loads(told.read_text()) | {"photos": "nowhere"}
-    told.write_text(json.dumps(gone))  # detected only after mapping
+    path = breakable.path / NAMES[0] / "object.json"
+    gone = json.loads(path.read_text()) | {"photos": "nowhere"}
+    path.write_text(json.dumps(gone))  # detected only after mapping
     bench = bench_in(tmp_path / "run")
     assert "nowhere" in run_benchmark(breakable, bench).failed[NAMES[0]]
     assert [path.name for path in (bench.folder / "maps").iterdir()] == [NAMES[1]]

@@ -106,7 +106,7 @@ def test_equal_options_make_equal_cities_and_another_seed_another(small):
 
 @pytest.mark.parametrize("values", [{"images": 39}, {"laps": 0}, {"images": 100, "laps": 6}])
 def test_a_city_that_is_too_small_is_an_error(values):
-    with pytest.raises(ValueError, match="images must be at least 20 a lap"):
+    with pytest.raises(ValueError, match="images must be at least 20 per lap"):
         CityOptions(**values)
 
 

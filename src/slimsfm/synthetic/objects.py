@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 from slimsfm.synthetic import shapes, texture
 from slimsfm.synthetic.texture import Picture
 
-_TEXELS_PER_METRE = 3500
+_TEXELS_PER_METER = 3500
 
 
 def printed_box(seed: int) -> trimesh.Trimesh:
@@ -79,8 +79,8 @@ OBJECTS: dict[str, Callable[[int], trimesh.Trimesh]] = {
 """From a seed of the print to a mesh in meters, z up, with the center of its box at the origin."""
 
 
-def _texels(metres: float) -> int:
-    return round(metres * _TEXELS_PER_METRE)
+def _texels(meters: float) -> int:
+    return round(meters * _TEXELS_PER_METER)
 
 
 def _faces(size: tuple[float, float, float]) -> list[tuple[int, int]]:
