@@ -11,6 +11,7 @@ from pathlib import Path
 
 from PIL import Image as PilImage
 from PIL import ImageDraw, ImageFont
+from slimsfm.report.query_video import FRAMES_PER_SECOND
 
 from benchmark_scenes import rendered
 from film import Film, film
@@ -21,7 +22,6 @@ from slimsfm.mapping import read_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
 from slimsfm.report.frames import draw_box
-from slimsfm.report.query_video import FRAMES_PER_SECOND
 from slimsfm.tracking import Tracked, Tracker
 from tracking import slim_map
 

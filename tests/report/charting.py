@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 
-from slimsfm.evaluation.outcomes import Outcomes
+from slimsfm.evaluation.results import Outcomes
 
 
 def drawn(axes, label):

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slimsfm.evaluation.outcomes import Outcomes
+from slimsfm.evaluation.results import Outcomes
 from slimsfm.report.failures import failures_html, query_changes, worst_and_others
 from slimsfm.report.report_data import load_report_data
 
@@ -17,13 +17,13 @@ def with_outcomes(result, key, errors, confidences):
     cells = [
         replace(
             cell,
-            trials=(replace(cell.trials[0], outcomes=outcomes_like(cell.outcomes, errors, confidences)),),
+            map_runs=(replace(cell.map_runs[0], outcomes=outcomes_like(cell.outcomes, errors, confidences)),),
         )
         if cell.key == key
         else cell
-        for cell in result.cells
+        for cell in result.measurements
     ]
-    return replace(result, cells=tuple(cells))
+    return replace(result, measurements=tuple(cells))
 
 
 def test_queries_that_only_one_map_localizes_are_lost_or_gained(run):

@@ -110,7 +110,7 @@ def test_queries_of_equal_names_are_numbered_and_missing_photos_are_left_out(run
     paths = [Path(folder, "1.png") for folder in "abc"]
     queries = tuple(replace(one, path=path) for one, path in zip(result.queries, paths, strict=True))
     photo = np.zeros((480, 640, 3), np.uint8)
-    outcomes = result.cells[0].trials[0].outcomes
+    outcomes = result.measurements[0].map_runs[0].outcomes
     named = draw_queries(
         replace(result, queries=queries), outcomes, lambda path: None if path == paths[1] else photo
     )

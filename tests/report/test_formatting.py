@@ -5,7 +5,7 @@ import pytest
 
 from slimsfm.evaluation.comparison import Comparison
 from slimsfm.evaluation.results import MappedObject
-from slimsfm.evaluation.statistics import Interval
+from slimsfm.evaluation.scores import Interval
 from slimsfm.report.formatting import (
     format_difference,
     format_dominating_set,

@@ -8,9 +8,8 @@ from PIL import Image
 
 from browsing import browsing, opened, viser, wait_until
 from slimsfm.errors import InputError
-from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import PointDescriptors
-from slimsfm.mapping.subset import copy_images, copy_points
+from slimsfm.mapping.subset import copy_images, copy_points, direct_map
 from slimsfm.report.live import MapWithSize, live_view
 from slimsfm.report.live_panel import DROPPED_RGB, KEPT_RGB, plain_markdown
 from slimsfm.report.scene3d import view_frame

@@ -6,8 +6,8 @@ from PIL import Image
 
 from browsing import Browser, browsing, opened, wait_until
 from poster import poster_camera, poster_map, poster_photo, poster_pose
-from slimsfm.mapping.direct import direct_map
 from slimsfm.mapping.map import PointDescriptors
+from slimsfm.mapping.subset import direct_map
 from slimsfm.report.live_panel import QUERY_RGB
 
 POSE = poster_pose((0.3, -0.3, -3.1))

@@ -8,8 +8,7 @@ import pytest
 from charting import drawn, texts
 
 from candidates import FULL, candidate, frontier_of
-from slimsfm.evaluation.scores import Scores
-from slimsfm.evaluation.statistics import Interval
+from slimsfm.evaluation.scores import Interval, Scores
 from slimsfm.evaluation.table import Row
 from slimsfm.localization import Seconds
 from slimsfm.report.figures import figure_svg

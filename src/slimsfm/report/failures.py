@@ -9,9 +9,8 @@ from jaxtyping import Float64
 
 from slimsfm.errors import ImageError
 from slimsfm.evaluation.comparison import Comparison
-from slimsfm.evaluation.metrics import SURE
-from slimsfm.evaluation.outcomes import Outcomes
-from slimsfm.evaluation.results import ObjectResult
+from slimsfm.evaluation.results import ObjectResult, Outcomes
+from slimsfm.evaluation.scores import SURE
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.photos import read_image
 from slimsfm.report.formatting import (
@@ -104,9 +103,9 @@ def query_changes(result: ObjectResult, comparison: Comparison) -> list[QueryCha
 def _compared(result: ObjectResult, comparison: Comparison) -> tuple[Outcomes, Outcomes]:
     """Outcomes of an object's queries before and after, in the first draw of each map."""
     before, after = (
-        cell.trials[0].outcomes
+        cell.map_runs[0].outcomes
         for key in (comparison.before, comparison.after)
-        if (cell := result.cell(*key))
+        if (cell := result.measurement(*key))
     )
     return before, after
 
@@ -148,7 +147,7 @@ def _summary(comparison: Comparison, found: Sequence[QueryChange]) -> str:
 _HEADS = (
     ColumnHead("Object", "name of the object", is_number=False),
     ColumnHead("Map", "reduced map and strategy", is_number=False),
-    ColumnHead("Query", "image file", is_number=False),
+    ColumnHead("PosedQuery", "image file", is_number=False),
     ColumnHead("Outcome", "lost: right with the full map only; gained: vice versa", is_number=False),
     ColumnHead("Error before", "relative to the object, with the full map"),
     ColumnHead("Confidence before", "estimated probability that the pose is right, with the full map"),

@@ -13,8 +13,7 @@ from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
 from slimsfm.errors import ImageError, InputError
-from slimsfm.evaluation.outcomes import Outcomes, join
-from slimsfm.evaluation.results import Cell, ObjectResult, Run
+from slimsfm.evaluation.results import Measurement, ObjectResult, Outcomes, Run, join_outcomes
 from slimsfm.evaluation.table import BY_FRAME, average_rows, rows_of
 from slimsfm.files import replacing
 from slimsfm.mapping.subset import keep_images
@@ -132,7 +131,7 @@ def _write_averages(writer: _Writer, run: Run) -> None:
     writer.save(frontier_chart(rows), Path(), "frontier")
     for method in dict.fromkeys(row.method for row in rows):
         cells = [_compared(result, method)[1] for result in run.objects if _cells(result, method)]
-        outcomes = join([cell.trials[0].outcomes for cell in cells])
+        outcomes = join_outcomes([cell.map_runs[0].outcomes for cell in cells])
         writer.save(reliability_chart(outcomes), Path(), "reliability", f"reliability-{method}")
 
 
@@ -147,14 +146,14 @@ def _write_method(writer: _Writer, maps: RunMaps) -> None:
     writer.save(graph_figure(drawing, thumbnails), place, "graph")
     for kind, figure in method_charts(maps).items():
         writer.save(figure, place, kind)
-    after = _compared(result, mapped.method)[1].trials[0].outcomes
+    after = _compared(result, mapped.method)[1].map_runs[0].outcomes
     _write_queries(writer, result, after, place)
 
 
 def method_charts(maps: RunMaps) -> dict[str, Figure]:
     """Charts that compare the full map with the dominating set, by kind."""
     result, chosen = maps.result, maps.mapped.dominating_set
-    before, after = (cell.trials[0].outcomes for cell in _compared(result, maps.mapped.method))
+    before, after = (cell.map_runs[0].outcomes for cell in _compared(result, maps.mapped.method))
     references = {name: image.cam_from_world() for name, image in maps.maps["full"].images.items()}
     queries = [query.cam_from_world for query in result.queries]
     verdicts = query_verdicts(before), query_verdicts(after)
@@ -164,11 +163,11 @@ def method_charts(maps: RunMaps) -> dict[str, Figure]:
     }
 
 
-def _cells(result: ObjectResult, method: str) -> list[Cell]:
-    return [cell for cell in result.cells if cell.method == method]
+def _cells(result: ObjectResult, method: str) -> list[Measurement]:
+    return [cell for cell in result.measurements if cell.method == method]
 
 
-def _compared(result: ObjectResult, method: str) -> tuple[Cell, Cell]:
+def _compared(result: ObjectResult, method: str) -> tuple[Measurement, Measurement]:
     """The full map and the dominating set, with the first strategy that both were measured with.
 
     Otherwise the full map and any other map with one strategy, or the same map twice.

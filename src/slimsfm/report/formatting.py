@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from html import escape
 from math import isfinite
 
-from slimsfm.evaluation.columns import Column, columns, number
-from slimsfm.evaluation.comparison import Comparison, Key
-from slimsfm.evaluation.formats import is_metric, p_value
+from slimsfm.evaluation.comparison import Comparison, MeasurementKey
+from slimsfm.evaluation.formats import format_p_value, is_metric
 from slimsfm.evaluation.results import MappedObject
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.table import Column, Row, all_columns, format_number
 from slimsfm.mapping.map import Map
 
 _EQUAL = "1.0"
@@ -21,7 +20,7 @@ _FILTER_ROWS = 12  # tables with more rows get a filter
 def plural(count: int, noun: str) -> str:
     """A count and its noun, in the plural where the count is not 1."""
     nouns = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
-    return f"{number(count)} {noun if count == 1 else nouns}"
+    return f"{format_number(count)} {noun if count == 1 else nouns}"
 
 
 def format_map(map: Map) -> str:
@@ -30,7 +29,7 @@ def format_map(map: Map) -> str:
     return points if map.is_for_direct_matching else f"{plural(len(map.images), 'image')}, {points}"
 
 
-def format_line(key: Key, methods: Sequence[str] = ()) -> str:
+def format_line(key: MeasurementKey, methods: Sequence[str] = ()) -> str:
     """Name of a line of the results table: map and strategy, and the method if there are several."""
     method, strategy, variant = key
     name = f"{variant} map, {strategy}"
@@ -52,7 +51,7 @@ def format_difference(comparison: Comparison) -> str:
         f"{value:+.1f}".replace("-", "\N{MINUS SIGN}")
         for value in (comparison.add_gain.low, comparison.add_gain.high)
     )
-    return f"difference {low} to {high} points, p {p_value(comparison.p_value)}"
+    return f"difference {low} to {high} points, p {format_p_value(comparison.p_value)}"
 
 
 def format_ratio(value: float, more: str, less: str) -> str:
@@ -69,8 +68,8 @@ def format_dominating_set(mapped: MappedObject) -> str:
     proof = "no smaller set can" if mapped.lower_bound >= count else f"at least {mapped.lower_bound} must"
     verb = "dominates" if count == 1 else "dominate"
     return (
-        f"{number(count)} of {plural(mapped.references, 'image')} {verb} the others ({proof}) and "
-        f"{'sees' if count == 1 else 'see'} {number(mapped.dominating_points)} of "
+        f"{format_number(count)} of {plural(mapped.references, 'image')} {verb} the others ({proof}) and "
+        f"{'sees' if count == 1 else 'see'} {format_number(mapped.dominating_points)} of "
         f"{plural(mapped.points, 'point')}."
     )
 
@@ -111,7 +110,7 @@ class NumberCell:
 
 
 NO_VALUE = NumberCell("\N{EN DASH}", None)
-"""Cell without a value."""
+"""Measurement without a value."""
 
 
 def table_html(
@@ -162,14 +161,14 @@ _LABELS = {
 }
 
 
-def rows_html(rows: Sequence[Row], marked: Sequence[Key] = ()) -> str:
+def rows_html(rows: Sequence[Row], marked: Sequence[MeasurementKey] = ()) -> str:
     """The results table with 95 % intervals in small print.
 
     Args:
         rows: Rows of one object, or of averages.
         marked: Highlighted lines.
     """
-    shown = columns(metric=is_metric(rows))
+    shown = all_columns(metric=is_metric(rows))
     varies = {name for name in ("object", "method") if len({getattr(row, name) for row in rows}) > 1}
     labels = [name for name in _LABELS if name in varies or name in ("strategy", "variant")]
     lines = [

@@ -1,4 +1,4 @@
-"""Query images with the estimated and the true box drawn in, and JPEGs embedded in the page."""
+"""PosedQuery images with the estimated and the true box drawn in, and JPEGs embedded in the page."""
 
 import base64
 import io

@@ -13,7 +13,7 @@ import viser.transforms
 
 from slimsfm.arrays import Image
 from slimsfm.errors import ImageError, SlimsfmError
-from slimsfm.evaluation.columns import number, size
+from slimsfm.evaluation.table import format_bytes, format_number
 from slimsfm.geometry import BOX_EDGES
 from slimsfm.localization import Seconds
 from slimsfm.mapping.map import Map
@@ -182,7 +182,7 @@ class ViewerPanel:
                 color = _SHOWN_COLOR if key == self.shown else _OTHER_COLOR
                 buttons[key] = self.client.gui.add_button(key, color=color)
                 buttons[key].on_click(lambda _, key=key: self.show(key))
-            text = f"{format_map(one.map)}, {size(one.num_bytes)}"
+            text = f"{format_map(one.map)}, {format_bytes(one.num_bytes)}"
             self.descriptions[key] = self.client.gui.add_markdown(text)
         return buttons
 
@@ -199,7 +199,7 @@ class ViewerPanel:
         shown = self._view.maps[self.shown].map
         seen = ""
         if name in _images_to_match(shown):
-            seen = f" sees {number(len(np.unique(shown.observations[name].points)))} points"
+            seen = f" sees {format_number(len(np.unique(shown.observations[name].points)))} points"
         self.message.content = f"**{plain_markdown(name)}**{seen}"
         self.fly_to(self.frusta[name])
 
@@ -212,7 +212,7 @@ class QueryControls:
         self._view, self._viewer, self._queries = view, viewer, view.queries
         self._frusta: dict[str, viser.CameraFrustumHandle] = {}
         gui = viewer.client.gui
-        with gui.add_folder("Query"):
+        with gui.add_folder("PosedQuery"):
             self.names = gui.add_dropdown("Image", self._queries.names)
             self.preview = gui.add_image(_NO_IMAGE)
             self.button = gui.add_button("Localize", color=QUERY_RGB)

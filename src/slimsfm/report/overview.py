@@ -5,13 +5,10 @@ from html import escape
 
 from matplotlib.figure import Figure
 
-from slimsfm.evaluation.columns import number, size
-from slimsfm.evaluation.comparison import Comparison
-from slimsfm.evaluation.formats import p_value
-from slimsfm.evaluation.outcomes import join
-from slimsfm.evaluation.results import ObjectResult
-from slimsfm.evaluation.summary import summarize_domination
-from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row
+from slimsfm.evaluation.comparison import Comparison, summarize_domination
+from slimsfm.evaluation.formats import format_p_value
+from slimsfm.evaluation.results import ObjectResult, join_outcomes
+from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row, format_bytes, format_number
 from slimsfm.report.failures import failures_html
 from slimsfm.report.figures import figure_svg
 from slimsfm.report.formatting import (
@@ -87,7 +84,7 @@ def _tiles(data: ReportData, line: Comparison) -> str:
     tiles = [
         (
             "Size of the map",
-            f"{size(before.map_bytes)} → {size(after.map_bytes)}",
+            f"{format_bytes(before.map_bytes)} → {format_bytes(after.map_bytes)}",
             format_ratio(line.smaller, "smaller", "larger") + mean,
         ),
         (
@@ -156,7 +153,7 @@ def _object_line(data: ReportData, result: ObjectResult, anchor: str) -> list[st
     mapped = result.maps[0]
     counts = (mapped.references, len(mapped.dominating_set))
     link = f'<a href="#{anchor}">{escape(result.name)}</a>'
-    start = [link, *(NumberCell(number(one), one) for one in counts)]
+    start = [link, *(NumberCell(format_number(one), one) for one in counts)]
     if not found:
         return [*start, *([NO_VALUE] * (len(_OBJECT_HEADS) - len(start)))]
     line = found[0]
@@ -164,12 +161,12 @@ def _object_line(data: ReportData, result: ObjectResult, anchor: str) -> list[st
     interval = after.intervals["add_0.1d"]
     return [
         *start,
-        *(NumberCell(size(row.map_bytes), row.map_bytes) for row in (before, after)),
+        *(NumberCell(format_bytes(row.map_bytes), row.map_bytes) for row in (before, after)),
         NumberCell(f"{line.add_before:.1f}", line.add_before),
         NumberCell(
             f"{line.add_after:.1f}", line.add_after, f"{interval.low:.1f}\N{EN DASH}{interval.high:.1f}"
         ),
-        NumberCell(p_value(line.p_value), line.p_value),
+        NumberCell(format_p_value(line.p_value), line.p_value),
         NumberCell(f"{line.faster:.1f}", line.faster),
     ]
 
@@ -181,8 +178,8 @@ def _averages(data: ReportData, lines: Sequence[Comparison]) -> str:
     rows = [*data.rows[BY_FRAME], *data.rows[BY_OBJECT]]
     charts = [frontier_chart(data.rows[BY_FRAME])]
     if lines:
-        cells = [cell for one in data.run.objects if (cell := one.cell(*lines[0].after))]
-        charts.append(reliability_chart(join([cell.outcomes for cell in cells])))
+        cells = [cell for one in data.run.objects if (cell := one.measurement(*lines[0].after))]
+        charts.append(reliability_chart(join_outcomes([cell.outcomes for cell in cells])))
     return f"""<section class="card"><h2>Averages</h2>
 {rows_html(rows, marked)}
 <p class="note">By frame: each query has the same weight. By object: each object has. Small print: 95 %

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from slimsfm.evaluation.outcomes import Outcomes
+from slimsfm.evaluation.results import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.report.figures import COLORS, INK, new_figure, styled
 from slimsfm.report.formatting import plural

@@ -4,17 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
-from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options
-from slimsfm.evaluation.comparison import Comparison, Key, against_full
-from slimsfm.evaluation.methods import parse_method
+from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options, parse_method
+from slimsfm.evaluation.comparison import Comparison, MeasurementKey, against_full
 from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row, average_rows, rows_of
 from slimsfm.evaluation.variants import parse_variant
 from slimsfm.graph import ReferenceGraph
-from slimsfm.graph.io import load_or_compute_graph
+from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
-from slimsfm.reduction import ReductionOptions
+from slimsfm.reduction import DominatingSetOptions
 
 _HEADLINES = ("default", "dominating")
 _FULL_OBJECTS = 6  # with more objects, each gets a share of the limits
@@ -38,14 +37,14 @@ class ReportData:
 
     @property
     def overall(self) -> str:
-        """Key of the rows and comparisons of the whole run."""
+        """MeasurementKey of the rows and comparisons of the whole run."""
         names = [one.name for one in self.run.objects]
         return BY_FRAME if len(names) > 1 else names[0]
 
     @property
     def methods(self) -> list[str]:
         """Names of the methods in the run."""
-        return list(dict.fromkeys(cell.method for one in self.run.objects for cell in one.cells))
+        return list(dict.fromkeys(cell.method for one in self.run.objects for cell in one.measurements))
 
     def headlines(self, name: str) -> list[Comparison]:
         """The comparisons in the headline of an object: `slimsfm reduce`'s default, and the dominating set.
@@ -56,7 +55,7 @@ class ReportData:
         firsts = [next((one for one in found if one.after[2] == kind), None) for kind in _HEADLINES]
         return [one for one in firsts if one] or found[:1]
 
-    def row(self, name: str, key: Key) -> Row:
+    def row(self, name: str, key: MeasurementKey) -> Row:
         """The row of a line of an object."""
         return next(row for row in self.rows[name] if (row.method, row.strategy, row.variant) == key)
 
@@ -105,12 +104,12 @@ def load_run_maps(run: Run, result: ObjectResult, method: str) -> RunMaps:
     Raises:
         MapError: A map is missing or damaged.
     """
-    variants = [cell.variant for cell in result.cells if cell.method == method]
+    variants = [cell.variant for cell in result.measurements if cell.method == method]
     kept = [one for one in dict.fromkeys(("full", *variants)) if not parse_variant(one).is_random]
     maps = {variant: read_map(run.map_path(result.name, method, variant)) for variant in kept}
     threshold = run.options["reduction"]["threshold"]
     # all options that the graph depends on
-    asked = BenchmarkOptions(edges=run.options["edges"], reduction=ReductionOptions(threshold=threshold))
+    asked = BenchmarkOptions(edges=run.options["edges"], reduction=DominatingSetOptions(threshold=threshold))
     options = graph_options(asked, parse_method(method))
     return RunMaps(
         result=result,

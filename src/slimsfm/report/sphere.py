@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from slimsfm.arrays import Mask, Points2D, Points3D
-from slimsfm.evaluation.outcomes import Outcomes
+from slimsfm.evaluation.results import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS, Box
 from slimsfm.report.figures import CHOSEN, DROPPED, INK, RIGHT_COLOR, new_figure, styled
 from slimsfm.report.formatting import plural

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
 
-from slimsfm.evaluation.columns import size
-from slimsfm.evaluation.statistics import Interval
+from slimsfm.evaluation.scores import Interval
 from slimsfm.evaluation.table import Row
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.reduction import Candidate, Frontier
@@ -147,7 +146,7 @@ def _chart(
         by_size.set_ylabel(label)
         by_size.set_yticks([tick for tick in by_size.get_yticks() if tick <= highest])
         by_size.set_ylim(*_limits(marks))
-        mark_logarithmic(by_size.xaxis, size)
+        mark_logarithmic(by_size.xaxis, format_bytes)
         mark_logarithmic(by_time.xaxis, lambda value: f"{value:g}")
         _draw_legend(figure, looks, headings, by_size)
         figure.draw_without_rendering()
