@@ -10,8 +10,8 @@
 The names below are loaded on first use (PEP 562), so that importing the package takes no time.
 """
 
-# pycolmap's wheel exports the symbols of its own zlib. If they were loaded first, they would replace half of the
-# system's zlib, and Python's `zlib` module would corrupt the heap. So `zlib` comes before pycolmap.
+# pycolmap's wheel exports the symbols of its own zlib. Loaded first, they would replace half of the system's
+# zlib, and Python's `zlib` module would corrupt the heap.
 import zlib as _zlib  # noqa: F401
 from importlib import import_module
 from typing import TYPE_CHECKING

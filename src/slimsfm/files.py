@@ -19,7 +19,7 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
     """
     try:
         if path.exists() and not overwrite:
-            raise OutputError(f"{path}: exists already; choose another output or pass --overwrite")
+            raise OutputError(f"{path}: exists already; choose another output or pass `overwrite=True`")
         parent = path.absolute().parent
         while not parent.exists():
             parent = parent.parent

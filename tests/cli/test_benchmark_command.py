@@ -111,7 +111,7 @@ def test_two_runs_are_compared_line_by_line(synthetic, boulder, tmp_path):
     assert line.startswith(f"{NAME}, sift, direct, full: ")
     assert "ADD-0.1d 100.0 -> 100.0 (+0.0 to +0.0, p 1.000)" in line
     alone = slimsfm("benchmark", "--compare", folder)
-    assert (alone.code, "takes two runs" in alone.err) == (2, True)
+    assert (alone.code, "required: AFTER; see slimsfm benchmark --compare --help" in alone.err) == (2, True)
     missing = slimsfm("benchmark", "--compare", folder, tmp_path / "nowhere")
     assert (missing.code, "nowhere" in missing.err) == (2, True)
 
@@ -139,6 +139,10 @@ def test_every_data_set_explains_itself(kind):
 
 
 def test_without_a_data_set_all_are_named():
-    assert "benchmark" in COMMANDS
     outcome = slimsfm("benchmark", "--help")
-    assert all(kind in outcome.out for kind in DATASETS)
+    assert all(f"  benchmark {kind} " in outcome.out for kind in DATASETS)
+
+
+def test_every_data_set_has_a_command():
+    named = [name.split()[1] for name in COMMANDS if name.startswith("benchmark ")]
+    assert named == [*DATASETS, "--compare"]

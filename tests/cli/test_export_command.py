@@ -29,7 +29,7 @@ def test_a_file_is_written_and_what_to_do_with_it_said(weights):
     outcome = slimsfm("export", "onnx", "superpoint", "-o", path, "--weights", weights)
     assert outcome.code == 0, outcome.err
     assert f"{path}: superpoint, " in outcome.out
-    assert "runs superpoint on the CPU as superpoint.onnx in the folder of weights" in outcome.out
+    assert "put it into the folder of weights as superpoint.onnx" in outcome.out
     assert sorted(contents(weights)) == ["superpoint.onnx", "superpoint_v1.pth"]
     again = slimsfm("export", "onnx", "superpoint", "-o", path)
     assert again.code == 2

@@ -165,7 +165,7 @@ def test_photos_of_another_size_than_the_camera_are_refused(project, making, wri
 
 
 def test_too_frequent_queries_and_other_names_are_refused(project, making):
-    with pytest.raises(InputError, match="--query-every 1 leaves 0 references of 9 images"):
+    with pytest.raises(InputError, match="`query_every=1` leaves 0 references of 9 images"):
         replace(project, query_every=1).load("cup", making)
     with pytest.raises(InputError, match="has no object '0'; it has cup"):
         project.load("0", making)

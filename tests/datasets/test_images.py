@@ -20,7 +20,7 @@ def test_every_third_from_the_first_is_a_query():
     ids=str,
 )
 def test_two_references_and_a_query_are_needed(names, every):
-    with pytest.raises(InputError, match=f"--query-every {every}"):
+    with pytest.raises(InputError, match=f"`query_every={every}`"):
         query_names(names, every)
 
 

@@ -95,7 +95,7 @@ def test_a_folder_is_called_by_its_own_name_from_within(photos, monkeypatch):
 
 @pytest.mark.parametrize("every", [0, 1])
 def test_too_frequent_queries_are_refused_before_any_work(photos, making, every):
-    with pytest.raises(InputError, match=f"--query-every {every} leaves"):
+    with pytest.raises(InputError, match=f"`query_every={every}` leaves"):
         Images(path=photos, query_every=every).load("box", making)
     assert not making.folder.exists()
 

@@ -224,7 +224,7 @@ def test_a_folder_of_other_options_is_refused_until_it_may_be_overwritten(whole,
     before = contents(folder)
     options = replace(OPTIONS, strategies=("direct",), variants=("full",))
     bench = Bench(folder=folder, options=options)
-    with pytest.raises(OutputError, match=r"run: holds a run of other options; choose .* --overwrite"):
+    with pytest.raises(OutputError, match=r"run: holds a run of other options; choose .* `overwrite=True`"):
         run_benchmark(dataset, bench)
     assert contents(folder) == before
     run = run_benchmark(dataset, bench, overwrite=True)

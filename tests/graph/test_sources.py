@@ -137,7 +137,7 @@ def test_auto_is_matches_or_tracks_where_there_are_none(exact):
     bare = replace(exact, matches={})
     assert resolve(bare, OPTIONS) == "tracks"
     assert [resolve(exact, GraphOptions(edges=edges)) for edges in EDGE_SOURCES] == list(EDGE_SOURCES)
-    with pytest.raises(InputError, match="no matches; use --edges tracks or localize"):
+    with pytest.raises(InputError, match="no matches; use `edges='tracks'` or `edges='localize'`"):
         edge_source(bare, GraphOptions(edges="matches"))
 
 

@@ -43,7 +43,7 @@ def test_the_given_camera_follows_a_resized_image(exact, tmp_path):
 
 def test_a_given_camera_of_another_shape_is_refused(exact, tmp_path):
     path = photo(tmp_path / "a.jpg", (480, 640))
-    with pytest.raises(ImageError, match=r"a\.jpg: has 480x640 pixels, its --camera 640x480"):
+    with pytest.raises(ImageError, match=r"a\.jpg: has 480x640 pixels, its camera 640x480"):
         query_camera(exact, path, camera())
 
 
@@ -73,7 +73,7 @@ def test_without_any_of_them_the_user_is_asked(exact, two_cameras, tmp_path):
         (exact, photo(tmp_path / "upright.png", (480, 640))),
         (two_cameras, photo(tmp_path / "plain.png")),
     ):
-        with pytest.raises(ImageError, match=f"{path.name}.*--camera FILE.*--focal unknown"):
+        with pytest.raises(ImageError, match=f"{path.name}.*camera=FILE.*focal='unknown'"):
             query_camera(map_, path, None)
 
 
@@ -95,7 +95,7 @@ def test_whatever_is_known_comes_before_a_guess(focal, exact, two_cameras, tmp_p
     assert query_camera(exact, silent, camera("SIMPLE_RADIAL"), focal).model_name == "SIMPLE_RADIAL"
     told = query_camera(two_cameras, photo(tmp_path / "b.jpg", focal_35mm=80), None, focal)
     assert told.focal_length == pytest.approx(80 * px_per_mm)
-    with pytest.raises(ImageError, match="its --camera 640x480"):
+    with pytest.raises(ImageError, match="its camera 640x480"):
         query_camera(exact, photo(tmp_path / "c.png", (480, 640)), camera(), focal)
 
 

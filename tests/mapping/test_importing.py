@@ -137,7 +137,7 @@ def test_the_database_is_found_where_colmap_puts_it_and_left_as_it_was(editable)
 def test_a_model_without_a_database_says_what_else_there_is(editable):
     (editable.folder / "database.db").unlink()
     with pytest.raises(
-        InputError, match=r"no database\.db beside the model.*--database.*--features.*--images"
+        InputError, match=r"no database\.db beside the model.*database=FILE.*features=FILE.*images=DIR"
     ):
         import_colmap(editable.model)
     with pytest.raises(InputError, match="no such database"):

@@ -1,21 +1,12 @@
 """`slimsfm build`."""
 
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import (
-    Flat,
-    ImagesPath,
-    OutputPath,
-    Stopwatch,
-    check_output,
-    console,
-    finish_map,
-    parse,
-)
+from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -25,8 +16,8 @@ def build_photos(
     images: ImagesPath,
     /,
     output: OutputPath,
-    build: Annotated[BuildOptions, Flat] = BuildOptions(),
-    networks: Annotated[Networks, Flat] = Networks(),
+    build: BuildOptions = BuildOptions(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     overwrite: bool = False,
 ) -> None:
     """Build a map from a folder of photos.
@@ -49,8 +40,3 @@ def build_photos(
     box = made.map.box
     console.print(f"box {made.map.info.box_source}, diagonal {box.diagonal:.3g} ({made.map.info.unit} unit)")
     finish_map(made.map, output, watch)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(build_photos, arguments)

@@ -1,12 +1,10 @@
 """`slimsfm demo`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from slimsfm.cli.output import Stopwatch, console, finish, parse
+from slimsfm.cli.options import Flags
+from slimsfm.cli.output import Stopwatch, console, finish
 from slimsfm.cli.results import report_run
 from slimsfm.datasets.synthetic import SynthesisOptions, Synthetic, synthesize
 from slimsfm.errors import OutputError
@@ -20,7 +18,7 @@ _OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=3
 
 
 def demo(
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("slimsfm-demo"), overwrite: bool = False
+    output: Annotated[Path, Flags(("-o", "--output"))] = Path("slimsfm-demo"), overwrite: bool = False
 ) -> None:
     """Do the main job on two objects that it renders itself: map, reduce, localize, measure, report.
 
@@ -30,7 +28,7 @@ def demo(
     """
     watch = Stopwatch()
     if output.exists() and any(output.iterdir() if output.is_dir() else [output]) and not overwrite:
-        raise OutputError(f"{output}: exists already; choose another output or pass --overwrite")
+        raise OutputError(f"{output}: exists already; choose another output or pass `overwrite=True`")
     folder, report = output / "objects", output / "report.html"
     with processes(num_cores()) as executor:
         synthesize(folder, _OBJECTS, overwrite=overwrite, progress=shown, executor=executor)
@@ -42,8 +40,3 @@ def demo(
     report_run(run)
     write_report(report, run, overwrite=True)
     finish(f"{bench.folder / 'results.json'} and {report}", watch, "build", "PHOTOS", "-o", "MAP")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(demo, arguments)

@@ -1,17 +1,17 @@
 """`slimsfm figures`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from matplotlib.figure import Figure
 from rich.markup import escape
 
 from slimsfm.arrays import Image
-from slimsfm.cli.output import OutputPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Argument, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.errors import ImageError, InputError
 from slimsfm.evaluation.outcomes import Outcomes, join
 from slimsfm.evaluation.result_files import read_run
@@ -48,7 +48,7 @@ _EXPLANATIONS = {
 
 
 def figures(
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")],
+    run: Annotated[Path, Argument("RUN")],
     /,
     output: OutputPath,
     format: Literal["png", "svg", "pdf"] = "png",
@@ -189,8 +189,3 @@ def _video(studio: _Studio, stack: ExitStack, folder: Path) -> Callable[[Image],
         return None
     path = studio.add(name, "video")
     return stack.enter_context(write_video(path, FRAMES_PER_SECOND, overwrite=studio.overwrite))
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(figures, arguments)

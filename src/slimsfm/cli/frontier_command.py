@@ -1,13 +1,13 @@
 """`slimsfm frontier`."""
 
 import json as json_format
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from slimsfm.cli.choices import frontier_to_json, print_frontier, promise
 from slimsfm.cli.execution import Execution, resumable
-from slimsfm.cli.output import Flat, MapPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Advanced, MapPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.errors import InputError
 from slimsfm.files import replacing
 from slimsfm.graph import GraphOptions
@@ -24,11 +24,11 @@ from slimsfm.report.figures import check_figure, save_figure
 def frontier_of(
     map: MapPath,
     /,
-    comparison: Annotated[FrontierOptions, Flat] = FrontierOptions(uses=USES),
+    comparison: FrontierOptions = FrontierOptions(uses=USES),
     edges: Edges = "auto",
     json: Path | None = None,
     curves: Path | None = None,
-    execution: Annotated[Execution, Flat] = Execution(),
+    execution: Annotated[Execution, Advanced()] = Execution(),
     overwrite: bool = False,
 ) -> None:
     """Tell what a map can be reduced to and what each way is predicted to lose; recommend one a use.
@@ -71,8 +71,3 @@ def frontier_of(
     if curves:
         save_figure(curves_figure(found, recommended, size), curves, overwrite=overwrite)
     finish(f"{len(found.candidates)} ways to reduce {map}", watch, "reduce", map, "-o", f"{map}-small")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(frontier_of, arguments)

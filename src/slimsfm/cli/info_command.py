@@ -1,10 +1,10 @@
 """`slimsfm info`."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
-from slimsfm.cli.output import MapPath, console, counts, parse, size
+from slimsfm.cli.options import MapPath
+from slimsfm.cli.output import console, counts, size
 from slimsfm.mapping.io import bytes_by_part, read_map
 
 
@@ -51,8 +51,3 @@ def _facts(path: Path) -> dict:
 
 def _to_json(facts: dict) -> str:
     return json.dumps(facts, indent=2)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(info, arguments)

@@ -1,6 +1,6 @@
 """`slimsfm localize`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,17 +9,8 @@ from typing import Annotated
 import pycolmap
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import (
-    Flat,
-    ImagesPath,
-    MapPath,
-    OutputPath,
-    Stopwatch,
-    check_output,
-    console,
-    finish,
-    parse,
-)
+from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.errors import InputError
 from slimsfm.execution import num_cores, on_threads
 from slimsfm.gravity import Gravity
@@ -42,8 +33,8 @@ def localize(
     /,
     output: OutputPath,
     also: tuple[Path, ...] = (),
-    localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
-    networks: Annotated[Networks, Flat] = Networks(),
+    localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     camera: Path | None = None,
     gravity: Path | None = None,
     workers: int | None = None,
@@ -145,8 +136,3 @@ def _outcome(one: Localization) -> str:
     return (
         f"{one.pose.num_inliers} inliers of {one.num_matches} matches, confidence {one.pose.confidence:.2f}"
     )
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(localize, arguments)

@@ -1,6 +1,5 @@
 """`slimsfm methods`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Annotated
@@ -8,7 +7,8 @@ from typing import Annotated
 from rich.table import Table
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import Flat, console, parse
+from slimsfm.cli.options import Advanced
+from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.features.methods import plugins
 from slimsfm.weights import WEIGHTS, find_weights
@@ -80,7 +80,7 @@ _METHODS = (
 )
 
 
-def methods(networks: Annotated[Networks, Flat] = Networks()) -> None:
+def methods(networks: Annotated[Networks, Advanced()] = Networks()) -> None:
     """List extractors, matchers and strategies: who wrote them, their licences, whether weights are here.
 
     Args:
@@ -121,8 +121,3 @@ def _found(method: _Method, name: str) -> str:
         return "yes" if find_weights(name) else "not in the folder"
     except InputError:
         return "no: another file of that name"
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(methods, arguments)

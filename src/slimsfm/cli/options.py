@@ -1,7 +1,8 @@
 """From the signature of a command to its options.
 
-A parameter of a simple type is an option; without a default it is required. A dataclass contributes its fields.
-Help texts are the docstrings of functions and fields. Markers in `Annotated` change how a parameter is written.
+A parameter of a simple type is an option; without a default it is required. A dataclass contributes its
+fields. Help texts are the docstrings of functions and fields. Markers in `Annotated` change how a parameter
+is written.
 """
 
 import ast
@@ -79,7 +80,7 @@ class Option:
     flags: tuple[str, ...]
     """How it is written; a positional argument has no flags."""
 
-    type: Any
+    kind: Any
     """A simple type, a `Literal` of strings or a tuple of these, without None."""
 
     default: Any
@@ -113,19 +114,19 @@ class Parameter:
     """A parameter of a function or a field of a dataclass."""
 
     name: str
-    type: Any
+    kind: Any
     marks: tuple[Any, ...]
     default: Any
 
-    def mark(self, kind: type) -> Any:
+    def mark(self, marker: type) -> Any:
         """Return the marker of this class, if there is one."""
-        return next((mark for mark in self.marks if mark is kind or isinstance(mark, kind)), None)
+        return next((mark for mark in self.marks if mark is marker or isinstance(mark, marker)), None)
 
     def fields(self) -> "list[Parameter]":
         """Return the fields of its dataclass, with the defaults that its own default gives them."""
-        hints = get_type_hints(self.type, include_extras=True)
+        hints = get_type_hints(self.kind, include_extras=True)
         found = []
-        for one in fields(self.type):
+        for one in fields(self.kind):
             default = one.default if one.default_factory is MISSING else one.default_factory()
             if self.default is not MISSING:
                 default = getattr(self.default, one.name)
@@ -159,7 +160,7 @@ def options_of(command: Command) -> list[Option]:
 
 def _parameter(name: str, hint: Any, default: Any, types: Mapping[str, type]) -> Parameter:
     base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    return Parameter(name=name, type=types.get(name, base), marks=tuple(marks), default=default)
+    return Parameter(name=name, kind=types.get(name, base), marks=tuple(marks), default=default)
 
 
 def _options(
@@ -168,18 +169,18 @@ def _options(
     """The options of a parameter: itself, or what the fields of its dataclass give."""
     advanced = of.mark(Advanced)
     is_advanced = is_advanced or advanced == ()
-    if is_dataclass(of.type):
-        inner, texts = f"{prefix}{of.name}." if of.mark(Prefixed) else prefix, _texts_of_fields(of.type)
+    if is_dataclass(of.kind):
+        inner, texts = f"{prefix}{of.name}." if of.mark(Prefixed) else prefix, _texts_of_fields(of.kind)
         for one in of.fields():
             apart = is_advanced or one.name in (advanced or ())
             yield from _options(one, (*key, one.name), inner, texts.get(one.name, ""), is_advanced=apart)
         return
-    plain, argument = _without_none(of.type), of.mark(Argument)
+    plain, argument = _without_none(of.kind), of.mark(Argument)
     written = f"--{prefix}{of.name.rstrip('_')}".replace("_", "-")
     yield Option(
         key=key,
         flags=() if argument else tuple(of.mark(Flags) or (written,)),
-        type=plain,
+        kind=plain,
         default=of.default,
         metavar=argument.metavar if argument else _metavar(plain),
         help=text,

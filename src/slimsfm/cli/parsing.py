@@ -1,5 +1,6 @@
 """From what was typed to a call of a command, and the help of a command as text."""
 
+import re
 import shlex
 import shutil
 import textwrap
@@ -39,9 +40,7 @@ def parse(command: Command, name: str, arguments: Sequence[str]) -> Callable[[],
     except ValueError as error:
         raise InputError(f"{error}; see slimsfm {name} --help") from None
     values |= {
-        one.name: shlex.join(["slimsfm", *name.split(), *arguments])
-        for one in parameters
-        if one.mark(Typed)
+        one.name: shlex.join(["slimsfm", *name.split(), *arguments]) for one in parameters if one.mark(Typed)
     }
     kinds = signature(command.function).parameters
     first = [values.pop(key) for key, one in kinds.items() if one.kind is one.POSITIONAL_ONLY]
@@ -72,6 +71,15 @@ def nearest(word: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+def with_flags(message: str) -> str:
+    """Write the options that a message of the library names, such as `overwrite=True`, as flags."""
+    return re.sub(r"`(\w+)=(?:True|'([^']+)'|(\w+))`", _flag, message)
+
+
+def _flag(match: re.Match[str]) -> str:
+    return f"--{match[1].replace('_', '-')} {match[2] or match[3] or ''}".strip()
+
+
 def _written(option: Option) -> str:
     """How a required argument stands in the usage."""
     return f"{option.flags[0]} {option.metavar}" if option.flags else option.metavar
@@ -94,8 +102,10 @@ class _Parser(ArgumentParser):
 def _parser_of(options: Sequence[Option]) -> ArgumentParser:
     parser = _Parser(add_help=False, allow_abbrev=False, argument_default=SUPPRESS)
     for option in options:
-        key, kind = ".".join(option.key), option.type
-        names = {"dest": key, "required": option.is_required} if option.flags else {"metavar": option.metavar}
+        key, kind = ".".join(option.key), option.kind
+        names: dict[str, Any] = {"metavar": option.metavar}
+        if option.flags:
+            names = {"dest": key, "required": option.is_required}
         if kind is bool:
             parser.add_argument(*option.flags, action="store_true", **names)
             continue
@@ -137,4 +147,4 @@ def _values(
             yield one.name, tuple(given[key]) if isinstance(given[key], list) else given[key]
         elif any(other[: len(key)] == key for other in given):
             inner = dict(_values(one.fields(), key, given))
-            yield one.name, one.type(**inner) if one.default is MISSING else replace(one.default, **inner)
+            yield one.name, one.kind(**inner) if one.default is MISSING else replace(one.default, **inner)

@@ -1,17 +1,15 @@
 """`slimsfm reduce`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
-
-import tyro
 
 from slimsfm.cli.choices import print_change, promise
 from slimsfm.cli.execution import Execution
 from slimsfm.cli.image_choice import ByImages
 from slimsfm.cli.limits import Limits
-from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Advanced, Flags, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.errors import InputError
 from slimsfm.features.methods import DETECTOR_FREE
 from slimsfm.mapping.direct import with_points
@@ -28,17 +26,17 @@ Use = Literal["direct", "images", "both"]
 class Choosing:
     """How what is kept is chosen."""
 
-    for_: Annotated[Use, tyro.conf.arg(name="for")] = "direct"
+    for_: Annotated[Use, Flags(("--for",))] = "direct"
     """Match queries with points (direct), with images (images), or either way (both); limits then hold for
     each of the two parts."""
 
     selector: str | None = None
     """Let this one choose the points: information, kcover, probabilistic or random."""
 
-    limits: Annotated[Limits, Flat] = Limits()
+    limits: Limits = Limits()
     """What the slim map must keep to."""
 
-    by: Annotated[ByImages, Flat] = ByImages()
+    by: ByImages = ByImages()
     """How images are chosen."""
 
     seed: int = 0
@@ -66,8 +64,8 @@ def reduce(
     map: MapPath,
     /,
     output: OutputPath,
-    choosing: Annotated[Choosing, Flat] = Choosing(),
-    execution: Annotated[Execution, Flat] = Execution(),
+    choosing: Choosing = Choosing(),
+    execution: Annotated[Execution, Advanced()] = Execution(),
     overwrite: bool = False,
 ) -> None:
     """Make a map small, and say what that costs.
@@ -125,8 +123,3 @@ def _slim(full: Map, chosen: dict[str, Candidate]) -> Map:
         return maker.make(*(one.choice for one in chosen.values()))
     points = maker.described(chosen["direct"].choice.points)
     return with_points(maker.make(chosen["images"].choice), full, points)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(reduce, arguments)

@@ -1,9 +1,7 @@
 """`slimsfm synthesize`."""
 
-from collections.abc import Sequence
-from typing import Annotated
-
-from slimsfm.cli.output import Flat, OutputPath, Stopwatch, finish, parse
+from slimsfm.cli.options import OutputPath
+from slimsfm.cli.output import Stopwatch, finish
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.execution import num_cores, processes
 from slimsfm.progress import shown
@@ -11,7 +9,7 @@ from slimsfm.progress import shown
 
 def synthesize_objects(
     output: OutputPath,
-    synthesis: Annotated[SynthesisOptions, Flat] = SynthesisOptions(),
+    synthesis: SynthesisOptions = SynthesisOptions(),
     overwrite: bool = False,
 ) -> None:
     """Render textured objects with exact ground truth, in OnePose's directory layout.
@@ -28,8 +26,3 @@ def synthesize_objects(
     first = made[0].name
     what = f"{output}: {len(made)} objects, {frames} frames with exact poses"
     finish(what, watch, "build", output / first / f"{first}-1" / "color_full", "-o MAP")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(synthesize_objects, arguments)

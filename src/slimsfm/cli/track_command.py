@@ -8,12 +8,12 @@ from typing import Annotated
 import cv2
 import numpy as np
 import pycolmap
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from slimsfm.arrays import Image
-from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.errors import InputError
 from slimsfm.files import uninterrupted
 from slimsfm.geometry import Box
@@ -26,7 +26,7 @@ from slimsfm.report.frames import TRUE_RGB, draw_box
 from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 from slimsfm.tracking.video import Frame, Frames, check_format, open_frames, write_video
 
-VideoPath = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="VIDEO")]
+VideoPath = Annotated[str, Argument("VIDEO")]
 
 _FAINTEST = 0.2  # opacity of the box of a pose that deserves no belief
 
@@ -37,8 +37,8 @@ def track(
     /,
     output: OutputPath,
     video: Path | None = None,
-    tracker: Annotated[TrackerOptions, Flat] = TrackerOptions(),
-    localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
+    tracker: TrackerOptions = TrackerOptions(),
+    localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
     camera: Path | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -156,8 +156,3 @@ def _sum_up(output: Path, results: Sequence[Tracked]) -> None:
         f"{output}: {number['tracked']} frames tracked, {number['localized']} localized on their own, "
         f"{number['lost']} lost; {rate:.0f} frames a second"
     )
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(track, arguments)

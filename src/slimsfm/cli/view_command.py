@@ -1,10 +1,10 @@
 """`slimsfm view`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from time import sleep
 
-from slimsfm.cli.output import MapPath, console, parse
+from slimsfm.cli.options import MapPath
+from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.localization.cameras import FocalLength, read_camera
 from slimsfm.mapping.io import bytes_by_part, read_map
@@ -59,8 +59,3 @@ def view(
                 )
         while True:
             sleep(3600)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(view, arguments)

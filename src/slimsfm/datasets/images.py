@@ -67,7 +67,7 @@ def query_names(names: list[str], every: int) -> list[str]:
     queries = sorted(names)[::every] if every >= 1 else []
     if not queries or len(names) - len(queries) < _TWO_VIEWS:
         raise InputError(
-            f"--query-every {every} leaves {len(names) - len(queries)} references of {len(names)} images; "
+            f"`query_every={every}` leaves {len(names) - len(queries)} references of {len(names)} images; "
             "two are needed"
         )
     return queries

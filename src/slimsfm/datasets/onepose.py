@@ -60,7 +60,7 @@ Frames = Literal["full", "cropped"]
 
 _SPLITS = ("train_data", "val_data", "test_data", "sample_data", "lowtexture_test_data")
 
-_MORE_FRAMES = "; where a video has more frames than poses, read the crops (--frames cropped)"
+_MORE_FRAMES = "; where a video has more frames than poses, read the crops (`frames='cropped'`)"
 
 _CORNER_ORDER = [0, 4, 5, 1, 2, 6, 7, 3]
 """Which corner of a `Box` is the k-th of the file."""
@@ -141,7 +141,7 @@ def read_sequence(directory: Path, *, frame_step: int = 1, frames: Frames = "ful
     if frames == "full" and not folder.is_dir() and (directory / "color").is_dir():
         raise InputError(
             f"{folder} is missing: take the full frames out of Frames.m4v with the authors' video2img.py, "
-            "or read the crops (--frames cropped)"
+            "or read the crops (`frames='cropped'`)"
         )
     images, poses = numbered(folder, ".png"), numbered(directory / "poses_ba", ".txt")
     check_paired(images, poses, "pose", "" if frames == "cropped" else _MORE_FRAMES)

@@ -124,7 +124,7 @@ def _claim(folder: Path, asked: dict, *, overwrite: bool) -> None:
     if known is not None:
         if not overwrite:
             raise OutputError(
-                f"{folder}: holds a run of other options; choose another output or pass --overwrite"
+                f"{folder}: holds a run of other options; choose another output or pass `overwrite=True`"
             )
         remove(folder)
     write_json(folder / "run.json", asked)

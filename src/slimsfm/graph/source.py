@@ -96,7 +96,7 @@ def resolve(map: Map, options: GraphOptions) -> str:
         InputError: The map has not what the source needs.
     """
     if options.edges == "matches" and not map.matches:
-        raise InputError("the map has no matches; use --edges tracks or localize")
+        raise InputError("the map has no matches; use `edges='tracks'` or `edges='localize'`")
     if options.edges != "auto":
         return options.edges
     return "matches" if map.matches else "tracks"

@@ -95,7 +95,7 @@ def query_camera(
     scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
     if given and scaled is None:
         raise ImageError(
-            f"{path}: has {exif.width}x{exif.height} pixels, its --camera {given.width}x{given.height}; "
+            f"{path}: has {exif.width}x{exif.height} pixels, its camera {given.width}x{given.height}; "
             "give the camera of this image"
         )
     if scaled and (given or not exif.has_prior_focal_length or _same_focal(exif, scaled)):
@@ -105,7 +105,7 @@ def query_camera(
     if focal == "known":
         raise ImageError(
             f"{path}: its focal length is unknown (no EXIF, and not of the map's camera); "
-            "give --camera FILE, or have it estimated with --focal unknown"
+            "give `camera=FILE`, or have it estimated with `focal='unknown'`"
         )
     return guess_camera(exif.width, exif.height)
 

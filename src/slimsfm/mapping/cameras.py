@@ -42,6 +42,6 @@ def _check_equal_sizes(guesses: dict[str, pycolmap.Camera]) -> None:
     if len(sizes) > 1:
         (size_a, a), (size_b, b) = list(sizes.items())[:2]
         raise InputError(
-            f"--camera shared: {a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
-            "images of one camera have one size, so use --camera auto"
+            f"`camera='shared'`: {a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
+            "images of one camera have one size, so use `camera='auto'`"
         )

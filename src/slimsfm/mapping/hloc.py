@@ -44,7 +44,7 @@ def write_hloc(map: Map, path: Path, queries: Iterable[str] = (), *, overwrite: 
     if map.is_for_direct_matching:
         raise MapError(
             "the map is for direct matching alone, and hloc matches images; "
-            "reduce the full map by `slimsfm reduce MAP -o SMALL --for images`"
+            "reduce the full map for images instead"
         )
     pairs = _pairs(queries, map)
     with replacing(path, overwrite=overwrite) as partial:

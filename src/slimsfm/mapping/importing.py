@@ -111,7 +111,7 @@ def _database_beside(model_path: Path) -> Path:
     if not found:
         raise InputError(
             f"{model_path}: no database.db beside the model; say where its descriptors come from with "
-            "--database FILE, --features FILE (hloc) or --images DIR"
+            "`database=FILE`, `features=FILE` (hloc) or `images=DIR`"
         )
     return found[0]
 

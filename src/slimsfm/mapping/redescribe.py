@@ -45,7 +45,7 @@ def redescribe(
     if described < _MIN_DESCRIBED * observations:
         raise ModelError(
             f"{folder}: SIFT features lie at only {described} of the {observations} keypoints that see a "
-            "point; are these the model's images? Else give its own features with --features or --database"
+            "point; are these the model's images? Else give its own: `features=FILE` or `database=FILE`"
         )
     return features, extractor
 

@@ -31,9 +31,7 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
         raise InputError("no image was chosen to be kept")
     for name in kept:
         if name not in map.images:
-            raise InputError(
-                f"image {name!r} is not in the map; `slimsfm info MAP --images` lists those that are"
-            )
+            raise InputError(f"image {name!r} is not one of the {len(map.images)} images of the map")
     chosen = frozenset(kept)
     features: Mapping[str, Features] = Selection(map.features, chosen.__contains__)
     matches: Mapping[tuple[str, str], IndexPairs] = Selection(map.matches, chosen.issuperset)
