@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from slimsfm.photos import read_image
     from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
     from slimsfm.reduction import FrontierOptions, frontier
+    from slimsfm.report.tracked_video import track_video
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 
 _MODULES = {
@@ -53,6 +54,7 @@ _MODULES = {
     "import_colmap": "slimsfm.mapping",
     "read_image": "slimsfm.photos",
     "read_map": "slimsfm.mapping",
+    "track_video": "slimsfm.report.tracked_video",
     "write_map": "slimsfm.mapping",
     "write_poses": "slimsfm.localization.pose_files",
 }
@@ -78,6 +80,7 @@ __all__ = [
     "import_colmap",
     "read_image",
     "read_map",
+    "track_video",
     "write_map",
     "write_poses",
 ]

@@ -1,6 +1,7 @@
 """The whole path through the command line, on one small rendered object."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -19,13 +20,14 @@ from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 
-def assert_done(outcome, made, next_command):
-    """A command ends with what it made, in which time, and with what to do next."""
+def assert_done(outcome, made, next_command=None):
+    """A command ends with what it made and how long that took, and with what to do next."""
     assert (outcome.code, outcome.err.strip()) == (0, "")
-    *_, last, next_line = outcome.out.splitlines()
-    assert last.startswith(str(made))
-    assert last.endswith(" s")
-    assert next_line.startswith(f"next: slimsfm {next_command} ")
+    lines = outcome.out.splitlines()
+    if next_command:
+        assert lines.pop().startswith(f"next: slimsfm {next_command} ")
+    assert lines[-1].startswith(str(made))
+    assert lines[-1].endswith(" s")
 
 
 def poses_of(path):
@@ -42,7 +44,7 @@ def poses_of(path):
 
 def test_synthesize(boulder):
     assert_done(boulder.synthesize, boulder.folder / "objects", "build")
-    assert f"1 objects, {MAPPING_FRAMES + QUERY_FRAMES} frames" in boulder.synthesize.out
+    assert f"1 object, {MAPPING_FRAMES + QUERY_FRAMES} frames" in boulder.synthesize.out
     assert len(list(boulder.photos.iterdir())) == MAPPING_FRAMES
     assert len(list(boulder.queries.iterdir())) == QUERY_FRAMES
     assert sorted(path.name for path in (boulder.folder / "objects").iterdir()) == [NAME]
@@ -64,9 +66,24 @@ def test_build_and_info(boulder, tmp_path):
     sizes = {name: size for name, size in facts["bytes"].items() if name != "total"}
     assert facts["bytes"]["total"] == sum(sizes.values()) > 0
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
-    told = slimsfm("info", tmp_path / "map", "--images").out
-    assert all(name in told for name in facts["images"])
+    listed = slimsfm("info", tmp_path / "map", "--images").out
+    assert all(name in listed for name in facts["images"])
     assert facts["images"][0] not in slimsfm("info", tmp_path / "map").out
+
+
+def test_info_says_what_kind_of_map_it_is(boulder, tmp_path):
+    small = tmp_path / "small"
+    arguments = ("--max-points", 60, "--selector", "kcover")
+    assert slimsfm("reduce", boulder.map_path, "-o", small, *arguments).code == 0
+    said = slimsfm("info", small).out
+    assert re.search(r"^kind +points for direct matching$", said, re.MULTILINE)
+    assert re.search(r"^origin +.*reduced", said, re.MULTILINE)
+    assert re.search(r"^points +60 points$", said, re.MULTILINE)
+    assert "observation" not in said
+    full = slimsfm("info", boulder.map_path).out
+    assert re.search(r"^kind +images with local features$", full, re.MULTILINE)
+    assert re.search(r"^box +estimated, diagonal [\d.]+ map units \(unknown scale\)$", full, re.MULTILINE)
+    assert re.search(r"mean reprojection error \d\.\d\d px", full)
 
 
 def test_reduce_keeps_a_dominating_set(boulder, reduced):
@@ -81,7 +98,7 @@ def test_reduce_keeps_a_dominating_set(boulder, reduced):
 
 
 def _never(_items, label):
-    raise AssertionError(f"{label}: computed though it was there")
+    raise AssertionError(f"{label}: computed although it is stored")
 
 
 def test_another_threshold_reuses_the_graph(reduced, boulder, tmp_path):
@@ -117,7 +134,7 @@ def test_localize_references_in_full_and_slim_map(boulder, tmp_path, strategy):
     for map_path in (boulder.map_path, slim):
         output = tmp_path / f"{map_path.name}.json"
         done = slimsfm("localize", map_path, photos, "-o", output, "--strategy", strategy)
-        assert_done(done, output, "info")
+        assert_done(done, output)
         found = poses_of(output)
         errors = [
             corner_error(pose, truth.images[name].cam_from_world(), truth.box) for name, pose in found.items()
@@ -132,8 +149,8 @@ def test_localize_one_image_with_its_camera(boulder, tmp_path):
     (tmp_path / "camera.txt").write_text(line)
     one, output = boulder.photos / "12.png", tmp_path / "pose.csv"
     done = slimsfm("localize", boulder.map_path, one, "-o", output, "--camera", tmp_path / "camera.txt")
-    assert_done(done, output, "info")
-    assert "1 of 1 images localized" in done.out
+    assert_done(done, output)
+    assert "1 of 1 image localized" in done.out
     assert len(output.read_text().splitlines()) == 2
 
 
@@ -147,11 +164,11 @@ def test_any_number_of_workers_gives_the_same_poses(boulder, tmp_path):
     assert found[0]
 
 
-def test_several_objects_are_sought_at_once(boulder, tmp_path):
+def test_several_objects_are_found_at_once(boulder, tmp_path):
     twin = shutil.copytree(boulder.map_path, tmp_path / "twin")
     output = tmp_path / "poses.json"
     done = slimsfm("localize", boulder.map_path, boulder.queries, "-o", output, "--also", twin)
-    assert_done(done, output, "info")
+    assert_done(done, output)
     rows = json.loads(output.read_text())["images"]
     assert [row["object"] for row in rows] == ["map", "twin"] * QUERY_FRAMES
     for one, other in zip(rows[::2], rows[1::2], strict=True):
@@ -185,7 +202,7 @@ def test_an_unknown_focal_length_is_estimated(boulder, tmp_path):
     assert row["focal_length_px"] == pytest.approx(boulder.map.shared_camera.mean_focal_length(), rel=0.03)
 
 
-def test_gravity_is_read_and_must_fit(boulder, tmp_path):
+def test_gravity_must_agree_with_the_pose(boulder, tmp_path):
     path = boulder.mapping.image_paths[12]
     down = boulder.map.images[path.name].cam_from_world().rotation.matrix() @ [0.0, 0.0, -1.0]
     gravity = tmp_path / "gravity.json"
@@ -202,14 +219,14 @@ def test_gravity_is_read_and_must_fit(boulder, tmp_path):
     assert not (tmp_path / "x.json").exists()
 
 
-def test_what_shows_nothing_of_the_object_is_not_localized(boulder, tmp_path):
+def test_images_without_the_object_are_not_localized(boulder, tmp_path):
     folder = tmp_path / "queries"
     folder.mkdir()
     Image.new("RGB", (320, 240)).save(folder / "black.png")
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     Image.fromarray(noise).save(folder / "noise.png")
     done = slimsfm("localize", boulder.map_path, folder, "-o", tmp_path / "poses.json")
-    assert_done(done, tmp_path / "poses.json", "info")
+    assert_done(done, tmp_path / "poses.json")
     assert "black.png: not localized" in done.out
     assert "noise.png: not localized" in done.out
     assert "0 of 2 images localized" in done.out
@@ -233,7 +250,7 @@ def test_overwrite_replaces_the_whole_map(boulder, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)], ids=str)
-def test_without_a_command_all_are_named(arguments):
+def test_without_a_command_all_are_listed(arguments):
     outcome = slimsfm(*arguments)
     assert (outcome.code, outcome.err) == (0, "")
     assert all(f"  {name.split()[0]} " in outcome.out for name in COMMANDS)
@@ -246,7 +263,7 @@ def test_every_command_explains_itself(command):
     assert outcome.out.startswith(f"usage: slimsfm {command} ")
 
 
-def test_it_runs_as_a_module_of_its_own():
+def test_the_package_runs_as_a_module():
     found = subprocess.run([sys.executable, "-m", "slimsfm", "--version"], capture_output=True, text=True)
     assert (found.returncode, found.stderr) == (0, "")
     assert found.stdout.startswith("slimsfm ")

@@ -137,7 +137,7 @@ def run(arguments: Sequence[str]) -> int:
         print(f"slimsfm: {with_flags(str(error))}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt as interruption:
-        outcome = str(interruption) or "no incomplete output is left"
+        outcome = str(interruption) or "no incomplete output was left behind"
         print(f"slimsfm: interrupted; {outcome}", file=sys.stderr)
         return EXIT_INTERRUPTED
     return 0

@@ -16,18 +16,20 @@ def build_photos(
     images: ImagesPath,
     /,
     output: OutputPath,
-    build: BuildOptions = BuildOptions(),
+    build: Annotated[BuildOptions, Advanced(("masks", "max_image_size", "max_features", "seed"))] = (
+        BuildOptions()
+    ),
     networks: Annotated[Networks, Advanced()] = Networks(),
     overwrite: bool = False,
 ) -> None:
     """Build a map from a folder of photos.
 
     Args:
-        images: Folder of photos, with those in its subfolders.
-        output: Where the map is written.
-        build: How to build.
+        images: Folder of photos; subfolders are included.
+        output: Folder of the map.
+        build: How to build the map.
         networks: Where learned methods run.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing map.
     """
     watch = Stopwatch()
     networks.apply()
@@ -36,7 +38,7 @@ def build_photos(
         made = build_map(images, Path(workspace), build, progress=shown)
         write_map(made.map, output, overwrite=overwrite)
     if made.left_out:
-        console.print(f"left out, for they fit the model nowhere: {', '.join(made.left_out)}", style="yellow")
+        console.print(f"could not be registered: {', '.join(made.left_out)}", style="yellow")
     box = made.map.box
     console.print(f"box {made.map.info.box_source}, diagonal {box.diagonal:.3g} ({made.map.info.unit} unit)")
     finish_map(made.map, output, watch)

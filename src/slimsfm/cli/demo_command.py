@@ -20,11 +20,11 @@ _OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=3
 def demo(
     output: Annotated[Path, Flags(("-o", "--output"))] = Path("slimsfm-demo"), overwrite: bool = False
 ) -> None:
-    """Do the main job on two objects that it renders itself: map, reduce, localize, measure, report.
+    """Build, reduce, localize, measure and report on two objects that the demo renders itself.
 
     Args:
-        output: Folder for the objects, the run with its maps and results.json, and report.html.
-        overwrite: Replace the demo that is there.
+        output: Folder of the objects, the run with its maps and results.json, and report.html.
+        overwrite: Replace an existing demo.
     """
     watch = Stopwatch()
     if output.exists() and any(output.iterdir() if output.is_dir() else [output]) and not overwrite:
@@ -36,7 +36,7 @@ def demo(
     dataset = Synthetic(path=folder, objects=_OBJECTS.objects)
     bench = Bench(folder=output / "run", progress=shown)
     run = run_benchmark(dataset, bench, progress=shown, overwrite=overwrite)
-    console.print(f"mapped, reduced, localized: {watch}")
+    console.print(f"built, reduced and localized: {watch}")
     report_run(run)
     write_report(report, run, overwrite=True)
     finish(f"{bench.folder / 'results.json'} and {report}", watch, "build", "PHOTOS", "-o", "MAP")

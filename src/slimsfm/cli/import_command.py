@@ -14,13 +14,13 @@ def import_(
     source: ImportOptions = ImportOptions(),
     overwrite: bool = False,
 ) -> None:
-    """Make a map of an existing COLMAP model and the descriptors of its keypoints.
+    """Make a map from a COLMAP model and the descriptors of its keypoints.
 
     Args:
         model: Folder with cameras, images and points3D, as .bin or .txt.
-        output: Where the map is written.
+        output: Folder of the map.
         source: Where the descriptors come from.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing map.
     """
     watch = Stopwatch()
     check_output(output, model, overwrite=overwrite)
