@@ -1,6 +1,7 @@
 """The whole path through the command line, on one small rendered object."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -76,8 +77,7 @@ def test_info_says_what_kind_of_map_it_is(boulder, tmp_path):
     arguments = ("--max-points", 60, "--selector", "kcover")
     assert slimsfm("reduce", boulder.map_path, "-o", small, *arguments).code == 0
     said = slimsfm("info", small).out
-    assert re.search(r"^kind +points for direct matching$", said, re.MULTILINE)
-    assert re.search(r"^origin +.*reduced", said, re.MULTILINE)
+    assert re.search(r"^kind +points for direct matching, reduced from a full map$", said, re.MULTILINE)
     assert re.search(r"^points +60 points$", said, re.MULTILINE)
     assert "observation" not in said
     full = slimsfm("info", boulder.map_path).out
@@ -270,3 +270,67 @@ def test_the_package_runs_as_a_module():
     unknown = subprocess.run([sys.executable, "-m", "slimsfm", "shrink"], capture_output=True, text=True)
     assert (unknown.returncode, unknown.stdout) == (2, "")
     assert unknown.stderr.startswith("slimsfm: 'shrink' is not a command; choose one of build, import, ")
+
+
+AND_NAME_LIBRARIES = """
+import sys
+from slimsfm.cli import main
+try:
+    main()
+finally:
+    libraries = ("numpy", "pycolmap", "scipy", "rich", "cv2")
+    print([one for one in libraries if hasattr(sys.modules.get(one), "__file__")], file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_the_same_without_the_libraries(command):
+    """A process that only prints help imports none of them, and says what it says with all of them."""
+    arguments = [sys.executable, "-c", AND_NAME_LIBRARIES, *command.split(), "--help"]
+    found = subprocess.run(arguments, capture_output=True, text=True)
+    assert (found.returncode, found.stderr) == (0, "[]\n")
+    assert found.stdout == slimsfm(*command.split(), "--help").out
+
+
+def test_help_groups_what_is_rarely_needed_and_shows_no_none():
+    said = slimsfm("localize", "--help").out
+    main, advanced = said.split("\nadvanced:\n")
+    assert "None" not in said
+    assert "--camera PATH" in main
+    assert "--max-iterations N" in advanced
+    assert "(default: auto)" in main
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (("biuld",), "'biuld' is not a command; did you mean build?"),
+        (("benchmark", "image"), "'image' is not a subcommand of benchmark; did you mean images?"),
+        (("export", "onx"), "'onx' is not a subcommand of export; did you mean onnx?"),
+        (("localize", "--cmera", "x"), "--cmera is not an option; did you mean --camera?"),
+    ],
+    ids=str,
+)
+def test_a_misspelled_word_is_answered_by_the_nearest(typed, meant):
+    outcome = slimsfm(*typed)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith(f"slimsfm: {meant}")
+    assert len(outcome.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", ["localize --help", "--help", "methods"])
+def test_a_reader_that_stops_early_sees_no_traceback(arguments):
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "slimsfm", *arguments.split()]
+    found = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert found.stderr == ""
+    assert found.returncode == 141
+
+
+def test_options_may_be_written_with_underscores_and_equal_signs(boulder, tmp_path):
+    output = tmp_path / "poses.csv"
+    arguments = (boulder.photos / "12.png", f"--output={output}", "--min_confidence=0.6")
+    assert slimsfm("localize", boulder.map_path, *arguments).code == 0
+    assert len(output.read_text().splitlines()) == 2

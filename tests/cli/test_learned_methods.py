@@ -1,4 +1,4 @@
-"""Learned methods on the command line: what is there, what is missing, and that nothing else needs them."""
+"""Learned methods on the command line: what is found, what is missing, and that nothing else needs them."""
 
 import os
 import subprocess
@@ -38,7 +38,7 @@ def environment_is_put_back(monkeypatch):
         monkeypatch.delenv(name)
 
 
-def test_methods_are_listed_with_licences_and_what_is_found(tmp_path):
+def test_methods_are_listed_with_licenses_and_found_weights(tmp_path):
     (tmp_path / "depth-save.pth").write_bytes(b"")
     (tmp_path / "aliked-n16.pth").write_bytes(b"")
     found = slimsfm("methods", "--weights", tmp_path)
@@ -56,7 +56,7 @@ def test_methods_are_listed_with_licences_and_what_is_found(tmp_path):
     }
     assert "research only" in lines["superpoint"]
     assert lines["disk"].rstrip().endswith("yes")
-    assert "another file of that name" in lines["aliked"]
+    assert "another file has this name" in lines["aliked"]
 
 
 def test_classical_methods_need_no_network_stack(boulder, tmp_path):

@@ -224,11 +224,16 @@ def test_bad_maps_outputs_and_options(refused, boulder, video, tmp_path):
     for option, value, naming in (
         ("--smoothing", -1, "smoothing must not be negative, got -1.0"),
         ("--focal", "unknown", "use --focal known and --camera FILE"),
-        ("--weights", tmp_path / "none", "none: no such folder of weights"),
         ("--lag", 0, "lag must be at least 1, got 0"),
         ("--camera", tmp_path / "missing.txt", "missing.txt"),
     ):
         refused(boulder.map_path, video, "-o", output, option, value, naming=naming)
+
+
+def test_weights_are_an_option(refused, boulder, video, tmp_path, monkeypatch):
+    monkeypatch.setenv("SLIMSFM_WEIGHTS", "")
+    arguments = ("-o", tmp_path / "poses.json", "--weights", tmp_path / "none", "--device", "cpu")
+    refused(boulder.map_path, video, *arguments, naming="none: no such folder of weights")
 
 
 def test_a_camera_of_another_shape(refused, boulder, video, tmp_path):

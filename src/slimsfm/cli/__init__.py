@@ -76,7 +76,7 @@ COMMANDS = {
 }
 """Every command. A name of two words is a subcommand."""
 
-_GROUPS = {
+GROUPS = {
     "benchmark": "measure accuracy, speed and size of full and reduced maps",
     "export": "write a learned method or a map for other programs",
 }
@@ -150,7 +150,7 @@ def _run_command(arguments: Sequence[str]) -> None:
         _check_name(first, [name.split()[0] for name in COMMANDS], "a command")
         _execute(first, rest)
     elif not rest or rest[0] in ("-h", "--help"):
-        print(f"usage: slimsfm {first} {subcommands[0].split()[1]} ... [OPTIONS]\n\n{_GROUPS[first]}:")
+        print(f"usage: slimsfm {first} {subcommands[0].split()[1]} ... [OPTIONS]\n\n{GROUPS[first]}:")
         print(_listed({name: COMMANDS[name].summary for name in subcommands}))
         print(f"\n`slimsfm {subcommands[0]} --help` explains one of them.")
     else:
@@ -188,7 +188,7 @@ def _asks_for_help(arguments: Sequence[str]) -> bool:
 
 def _top_level() -> dict[str, str]:
     """The first words of all commands with their summaries."""
-    return {name.split()[0]: _GROUPS.get(name.split()[0], entry.summary) for name, entry in COMMANDS.items()}
+    return {name.split()[0]: GROUPS.get(name.split()[0], entry.summary) for name, entry in COMMANDS.items()}
 
 
 def _listed(summaries: Mapping[str, str]) -> str:

@@ -71,7 +71,7 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
 def _kind(map: Map) -> str:
     """What queries are matched with."""
     if map.is_for_direct_matching:
-        return "points for direct matching"
+        return "points for direct matching, reduced from a full map"
     if map.photos:
         return "photos to match without a detector"
     if map.point_descriptors:

@@ -134,6 +134,5 @@ def _print(results: Mapping[str, Found], *, several: bool) -> None:
 def _outcome(one: Localization) -> str:
     if one.pose is None:
         return "not localized"
-    return (
-        f"{one.pose.num_inliers} inliers of {one.num_matches} matches, confidence {one.pose.confidence:.2f}"
-    )
+    inliers = f"{one.pose.num_inliers} inliers of {one.num_matches} matches"
+    return f"{inliers}, confidence {one.pose.confidence:.2f}"

@@ -15,7 +15,14 @@ from slimsfm.mapping.map import Map
 
 _WIDTH = 170  # of the widest table; a narrower terminal wraps lines, but no number is cut off
 
-console = Console(highlight=False, soft_wrap=True, width=_WIDTH)
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to the command line, as `print` does."""
+        raise BrokenPipeError
+
+
+console = _Console(highlight=False, soft_wrap=True, width=_WIDTH)
 
 
 def check_output(output: Path, source: Path, *, overwrite: bool) -> None:

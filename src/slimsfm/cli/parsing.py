@@ -51,8 +51,7 @@ def help_of(command: Command, name: str) -> str:
     """Return what `--help` prints of a command."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     options = options_of(command)
-    required = [_written(one) for one in options if one.is_required]
-    parts = [textwrap.fill(f"usage: slimsfm {name} {' '.join(required)} [OPTIONS]", width)]
+    parts = [textwrap.fill(f"usage: {usage_of(command, name)}", width)]
     parts += [textwrap.fill(" ".join(one.split()), width) for one in command.description.split("\n\n")]
     groups = {
         "arguments": [one for one in options if not one.flags],
@@ -65,8 +64,14 @@ def help_of(command: Command, name: str) -> str:
     return "\n\n".join(parts)
 
 
+def usage_of(command: Command, name: str) -> str:
+    """Return the shortest command line of a command, with placeholders."""
+    required = [_written(one) for one in options_of(command) if one.is_required]
+    return " ".join(["slimsfm", name, *required, "[OPTIONS]"])
+
+
 def nearest(word: str, known: Sequence[str]) -> str:
-    """Return `; did you mean ...?` where a word resembles a known one, else what is known."""
+    """Return `; did you mean ...?` if a word resembles a known one, otherwise an empty string."""
     close = get_close_matches(word, known, n=1)
     return f"; did you mean {close[0]}?" if close else ""
 

@@ -10,7 +10,6 @@ import warnings
 
 import numpy as np
 from jaxtyping import Float32, Int64
-from scipy.cluster.vq import kmeans2
 from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors
@@ -26,6 +25,8 @@ def learn_words(descriptors: Descriptors, seed: int = 0) -> Float32[np.ndarray, 
     Raises:
         ValueError: There is no descriptor.
     """
+    from scipy.cluster.vq import kmeans2  # slow to import, and not needed where the map has its words
+
     if not len(descriptors):
         raise ValueError("descriptors must have at least one row to learn words from")
     rng = np.random.default_rng(seed)
