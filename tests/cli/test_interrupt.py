@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from commands import contents, slimsfm
+from commands import contents, messages, slimsfm
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map
@@ -77,7 +77,7 @@ def assert_interrupted(process, how, tmp_path, what_now="no incomplete output wa
         process.send_signal(how)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130, (out, err)
-    assert [line for line in err.splitlines() if line.strip()] == [f"slimsfm: interrupted; {what_now}"]
+    assert messages(err) == [f"slimsfm: interrupted; {what_now}"]
     assert list((tmp_path / "tmp").iterdir()) == []
 
 

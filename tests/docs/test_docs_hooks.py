@@ -16,7 +16,7 @@ def test_a_formula_becomes_mathml_and_the_rest_stays(hook):
     assert made.endswith("</math> edge, <code>$x$</code></p>")
 
 
-def test_a_displayed_formula_has_a_line_of_its_own(hook):
+def test_a_displayed_formula_has_its_own_line(hook):
     made = hook("mathematics").on_page_content('<div class="arithmatex">\\[\n\\frac{1}{8 d}\n\\]</div>')
     assert 'display="block"' in made
     assert "<mfrac>" in made
@@ -53,7 +53,7 @@ def test_a_section_of_an_unknown_command_is_an_error(hook):
         ("index.md", "#in-python", "#in-python"),
     ],
 )
-def test_links_lead_from_page_to_page_as_from_file_to_file(hook, page, link, on_site):
+def test_links_between_files_become_links_between_pages(hook, page, link, on_site):
     asking = SimpleNamespace(file=SimpleNamespace(src_uri=page))
     made = hook("repository").on_page_markdown(f"[one]({link}), [`two`]({link})", page=asking)
     assert made == f"[one]({on_site}), [`two`]({on_site})"

@@ -24,7 +24,7 @@ from slimsfm.photos import list_images, read_image
 from slimsfm.progress import shown
 
 Found = dict[str, Localization]
-"""The outcome for each object in one image."""
+"""The outcome of each object in one image."""
 
 
 def localize(
