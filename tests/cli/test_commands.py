@@ -82,7 +82,7 @@ def test_info_says_what_kind_of_map_it_is(boulder, tmp_path):
     assert "observation" not in said
     full = slimsfm("info", boulder.map_path).out
     assert re.search(r"^kind +images with local features$", full, re.MULTILINE)
-    assert re.search(r"^box +estimated, diagonal [\d.]+ map units \(unknown scale\)$", full, re.MULTILINE)
+    assert re.search(r"^box +given, diagonal \d\.\d+ metre$", full, re.MULTILINE)
     assert re.search(r"mean reprojection error \d\.\d\d px", full)
 
 

@@ -16,7 +16,7 @@ from slimsfm.graph.io import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
-PATIENCE_S = 20
+PATIENCE_S = 60
 GOES_ON = "run the same command again to resume"
 
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from commands import slimsfm
+from commands import messages, slimsfm
 from slimsfm.weights import FOLDER
 
 WITHOUT = """
@@ -93,13 +93,17 @@ def test_an_unknown_extractor_or_matcher_or_folder_is_named(boulder, tmp_path):
     assert not out.exists()
 
 
-def test_missing_weights_are_named_before_anything_is_written(boulder, tmp_path, monkeypatch):
-    loading = pytest.importorskip("slimsfm.networks.loading", exc_type=ImportError)
-    monkeypatch.setattr(loading, "_from_hugging_face", lambda _address: None)
-    monkeypatch.setattr(loading, "_from_address", lambda _address: None)
-    found = slimsfm(
-        "build", boulder.photos, "-o", tmp_path / "map", "--extractor", "superpoint", "--weights", tmp_path
+def test_missing_weights_are_named_before_anything_is_written(boulder, tmp_path):
+    pytest.importorskip("slimsfm.networks.loading", exc_type=ImportError)
+    out, cache = tmp_path / "map", tmp_path / "cache"
+    options = ("-o", out, "--extractor", "superpoint", "--weights", tmp_path)
+    found = subprocess.run(
+        [sys.executable, "-m", "slimsfm", *map(str, ("build", boulder.photos, *options))],
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(cache)},
+        capture_output=True,
+        text=True,
     )
-    assert found.code == 2
-    assert "weights superpoint_v1.pth are missing; get them from the SuperGluePretrainedNetwork" in found.err
-    assert not (tmp_path / "map").exists()
+    assert found.returncode == 2
+    (line,) = messages(found.stderr)
+    assert "weights superpoint_v1.pth are missing; get them from the SuperGluePretrainedNetwork" in line
+    assert not out.exists()
