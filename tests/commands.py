@@ -1,4 +1,4 @@
-"""The command line, run in this process."""
+"""Runs the command line in this process."""
 
 import re
 from contextlib import redirect_stderr, redirect_stdout
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from slimsfm.cli import run
 
-_PROGRESS = re.compile(r".+: (started|\d+ of \d+( in .* s|, .* left| after .* s)?|\w+ (after|for) [\d.]+ s)")
+_PROGRESS = re.compile(r"(?!slimsfm: ).+: (started$|\d+ of \d+|(done|stopped) after |running for )")
 
 
 @dataclass(frozen=True)
@@ -17,25 +17,22 @@ class Outcome:
     out: str
     err: str
     """Standard error without lines of progress."""
-    progress: str
-    """Lines of progress."""
-
-
-def without_progress(err: str) -> str:
-    """Standard error of a command without its lines of progress."""
-    return "".join(line for line in err.splitlines(True) if not _PROGRESS.fullmatch(line.rstrip("\n")))
 
 
 def slimsfm(*arguments: object) -> Outcome:
     with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
         code = run([str(argument) for argument in arguments])
-    said = err.getvalue()
-    progress = "".join(line for line in said.splitlines(True) if _PROGRESS.fullmatch(line.rstrip("\n")))
-    return Outcome(code, out.getvalue(), without_progress(said), progress)
+    return Outcome(code, out.getvalue(), "".join(f"{line}\n" for line in messages(err.getvalue())))
+
+
+def messages(standard_error: str) -> list[str]:
+    """The lines on standard error that are neither blank nor progress."""
+    lines = [line for line in standard_error.splitlines() if line.strip()]
+    return [line for line in lines if not _PROGRESS.match(line)]
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
-    """Everything below a folder: files with their bytes, folders with None."""
+    """All paths in a folder: files with their bytes, folders with None."""
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))

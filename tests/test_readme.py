@@ -24,7 +24,7 @@ def test_the_python_lines_run_and_print_a_pose(tmp_path):
     assert len(re.findall(r"-?\d\.\d+", done.stdout)) == 12
 
 
-def test_the_two_commands_are_there():
+def test_the_two_commands_are_given():
     text = README.read_text()
     assert "pip install . && slimsfm demo" in text
     assert "pip install -e '.[all,test]' && pytest" in text

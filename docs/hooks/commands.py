@@ -1,60 +1,67 @@
-"""The help of every command, asked of the program itself when the site is built: it cannot go stale."""
+"""Tables of the options of every command, made of the program itself when the site is built."""
 
-import os
-import re
-import textwrap
 from collections.abc import Iterator
-from contextlib import redirect_stderr, redirect_stdout
-from io import StringIO
 from typing import Any
-from unittest.mock import patch
 
-PLACE = "<!-- the help of every command is put here -->"
-
-_WIDTH = 80
-_ANSI = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-_KIND = re.compile(r"more:\s+slimsfm\s+\w+\s+(\S+)\s+--help")
+PLACE = "<!-- the tables of all commands are inserted here -->"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in the page that has the place for it."""
-    return markdown.replace(PLACE, "\n".join(_sections())) if PLACE in markdown else markdown
+    """Fill in the page that has the place for the tables."""
+    return markdown.replace(PLACE, "\n\n".join(_sections())) if PLACE in markdown else markdown
 
 
-def help_of(*command: str) -> str:
-    """What a command says with --help: plain text in lines of 80 characters.
+def section_of(name: str) -> str:
+    """Return the description of a command, its usage and the table of its options, as Markdown.
 
     Raises:
-        RuntimeError: It fails.
+        KeyError: There is no such command.
     """
-    from slimsfm.cli import run
+    from slimsfm.cli import COMMANDS
+    from slimsfm.cli.options import options_of
+    from slimsfm.cli.parsing import usage_of
 
-    with (
-        patch.dict(os.environ, COLUMNS=str(_WIDTH), NO_COLOR="1"),
-        redirect_stdout(StringIO()) as said,
-        redirect_stderr(StringIO()) as error,
-    ):
-        code = run([*command, "--help"])
-    if code:
-        raise RuntimeError(f"slimsfm {' '.join(command)} --help fails: {error.getvalue()}")
-    lines = _ANSI.sub("", said.getvalue()).splitlines()
-    return "\n".join(textwrap.fill(line, _WIDTH) if len(line) > _WIDTH else line.rstrip() for line in lines)
+    command = COMMANDS[name].load()
+    options = options_of(command)
+    groups = {
+        "": [one for one in options if not one.is_advanced],
+        "Advanced options": [one for one in options if one.is_advanced],
+    }
+    parts = [command.description, f"```sh\n{usage_of(command, name)}\n```"]
+    for title, members in groups.items():
+        if members:
+            table = "\n".join(["| | | default |", "|---|---|---|", *(_row(one) for one in members)])
+            parts.append(f'??? note "{title}"\n\n{_indented(table)}' if title else table)
+    return "\n\n".join(parts)
 
 
 def _sections() -> Iterator[str]:
-    from slimsfm.cli import COMMANDS
+    from slimsfm.cli import COMMANDS, GROUPS
 
-    for name, what in COMMANDS.items():
-        said = help_of(name)
-        yield f"## {name}\n\n{what[0].upper()}{what[1:]}.\n\n```text\n{said}\n```\n"
-        for kind in _kinds(said):
-            folded = textwrap.indent(f"```text\n{help_of(name, kind)}\n```", "    ")
-            yield f'### {name} {kind}\n\n??? info "`slimsfm {name} {kind} --help`"\n\n{folded}\n'
+    seen: set[str] = set()
+    for name in COMMANDS:
+        first, _, second = name.partition(" ")
+        if second and first not in seen:
+            yield f"## {first}\n\n{GROUPS[first].capitalize()}."
+            seen.add(first)
+        yield f"{'###' if second else '##'} {name}\n\n{section_of(name)}"
 
 
-def _kinds(said: str) -> Iterator[str]:
-    """What a command's help says that there is more help for."""
-    from slimsfm.datasets import DATASETS
+def _row(option: Any) -> str:
+    written = ", ".join(option.flags) if option.flags else option.metavar
+    if option.flags and option.metavar:
+        written += f" {option.metavar}"
+    default = f"`{option.default_text}`" if option.default_text else "required" if option.is_required else ""
+    return f"| {_code(written)} | {_escaped(option.help)} | {default} |"
 
-    for kind in _KIND.findall(said):
-        yield from DATASETS if kind == "DATASET" else [kind]
+
+def _code(text: str) -> str:
+    return f"`{text}`".replace("|", "\\|")
+
+
+def _escaped(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"    {line}" for line in text.splitlines())

@@ -1,4 +1,4 @@
-"""The notebook of the examples as a page of the site."""
+"""Adds the notebook of the examples to the site as a page."""
 
 import base64
 import json
@@ -21,15 +21,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         if isinstance(part, bytes):
             name = f"walkthrough/{sum(one.startswith('![') for one in parts) + 1}.png"
             files.append(File.generated(config, name, content=part))
-            part = f"![What the lines above draw](../docs/{name})"
+            part = f"![Output of the code above](../docs/{name})"
         parts.append(part)
-    parts.append(f'All of it as a notebook: <a href="{NOTEBOOK}" download><code>slimsfm.ipynb</code></a>.')
+    parts.append(f'Download the notebook: <a href="{NOTEBOOK}" download><code>slimsfm.ipynb</code></a>.')
     files.append(File.generated(config, PAGE, content="\n\n".join(parts) + "\n"))
     return files
 
 
 def parts_of(notebook: dict[str, Any]) -> Iterator[str | bytes]:
-    """Text of the page in order; pictures, PNG, as bytes."""
+    """Yield the text of the page in order, and pictures as bytes of a PNG."""
     for cell in notebook["cells"]:
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":

@@ -1,6 +1,6 @@
-"""What lies outside docs/ and belongs on the site: the changelog, how to contribute, the examples.
+"""Adds files outside docs/ to the site: the changelog, the guide for contributors, the examples.
 
-Links are written as GitHub wants them, from where a file lies in the repository; they are turned here.
+Links in the files are relative to their place in the repository, as on GitHub. They are rewritten here.
 """
 
 import re
@@ -18,7 +18,7 @@ PAGES = {
     "README.md": "index.md",
     "examples/slimsfm.ipynb": "walkthrough.md",
 }
-"""Files outside docs/ and the pages that stand for them."""
+"""Files outside docs/ and their pages."""
 
 _COPIED = ("*.py", "*.toml", "*.ipynb")
 _CODE = r"^(?P<fence>`{3,}).*?^(?P=fence)|`[^`\n]+`"
@@ -26,7 +26,7 @@ _LINK = re.compile(_CODE + r"|(?<=\]\()(?!\w+:|#|/)(?P<target>[^)\s#]+)", re.DOT
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages, and the examples as files."""
+    """Add the pages, and the examples as files to download."""
     root = Path(config.config_file_path).parent
     for source, page in PAGES.items():
         if not files.get_file_from_path(page):
@@ -39,7 +39,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Turn links between places in the repository into links between places on the site."""
+    """Rewrite links between files of the repository as links between pages of the site."""
     sources = {place: source for source, place in PAGES.items() if place != "index.md"}
     here = PurePosixPath(sources.get(page.file.src_uri, f"docs/{page.file.src_uri}"))
 
@@ -53,5 +53,5 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 
 def place_of(path: str) -> str:
-    """Where a file of the repository is found on the site."""
+    """Return the place on the site of a file of the repository."""
     return PAGES.get(path, path.removeprefix("docs/"))

@@ -1,5 +1,98 @@
-"""slimsfm: make a Structure-from-Motion model small and localizing in it fast, and know what that costs."""
+"""slimsfm: small, fast COLMAP maps for visual localization and 6-DoF object pose.
 
-# Before pycolmap, whose wheel exports the symbols of a zlib of its own: loaded first, they would stand in for
-# half of the system's, and Python's zlib would then corrupt the heap.
+    import slimsfm
+
+    full = slimsfm.build_map("photos")
+    small = slimsfm.reduce(full)
+    slimsfm.write_map(small.map, "small")
+    result = slimsfm.Localizer(small.map).localize(slimsfm.read_image("query.jpg"))
+
+The names below are loaded on first use (PEP 562), so that importing the package takes no time.
+"""
+
+# pycolmap's wheel exports the symbols of its own zlib. Loaded first, they would replace half of the system's
+# zlib, and Python's `zlib` module would corrupt the heap.
 import zlib as _zlib  # noqa: F401
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
+    from slimsfm.localization.pose_files import write_poses
+    from slimsfm.mapping import (
+        BuildOptions,
+        ImportOptions,
+        Map,
+        build_map,
+        import_colmap,
+        read_map,
+        write_map,
+    )
+    from slimsfm.photos import read_image
+    from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+    from slimsfm.reduction import FrontierOptions, frontier
+    from slimsfm.report.tracked_video import track_video
+    from slimsfm.tracking import Tracked, Tracker, TrackerOptions
+
+_MODULES = {
+    "BuildOptions": "slimsfm.mapping",
+    "FrontierOptions": "slimsfm.reduction",
+    "ImportOptions": "slimsfm.mapping",
+    "Localization": "slimsfm.localization",
+    "LocalizationOptions": "slimsfm.localization",
+    "Localizer": "slimsfm.localization",
+    "Map": "slimsfm.mapping",
+    "MultiLocalizer": "slimsfm.localization",
+    "PoseEstimate": "slimsfm.pose",
+    "RansacOptions": "slimsfm.pose",
+    "Tracked": "slimsfm.tracking",
+    "Tracker": "slimsfm.tracking",
+    "TrackerOptions": "slimsfm.tracking",
+    "build_map": "slimsfm.mapping",
+    "estimate_pose": "slimsfm.pose",
+    "frontier": "slimsfm.reduction",
+    "import_colmap": "slimsfm.mapping",
+    "read_image": "slimsfm.photos",
+    "read_map": "slimsfm.mapping",
+    "track_video": "slimsfm.report.tracked_video",
+    "write_map": "slimsfm.mapping",
+    "write_poses": "slimsfm.localization.pose_files",
+}
+"""The module of each public name. A new name needs a line here, in `__all__` and in the imports above."""
+
+__all__ = [
+    "BuildOptions",
+    "FrontierOptions",
+    "ImportOptions",
+    "Localization",
+    "LocalizationOptions",
+    "Localizer",
+    "Map",
+    "MultiLocalizer",
+    "PoseEstimate",
+    "RansacOptions",
+    "Tracked",
+    "Tracker",
+    "TrackerOptions",
+    "build_map",
+    "estimate_pose",
+    "frontier",
+    "import_colmap",
+    "read_image",
+    "read_map",
+    "track_video",
+    "write_map",
+    "write_poses",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'slimsfm' has no attribute {name!r}")
+    value = getattr(import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

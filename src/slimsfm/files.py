@@ -21,7 +21,7 @@ def check_writable(path: str | Path, *, overwrite: bool) -> None:
     path = Path(path)
     try:
         if path.exists() and not overwrite:
-            raise OutputExistsError(f"{path}: exists already; choose another output or overwrite it")
+            raise OutputExistsError(f"{path}: exists already; choose another output or pass `overwrite=True`")
         parent = path.absolute().parent
         while not parent.exists():
             parent = parent.parent

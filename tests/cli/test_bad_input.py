@@ -1,4 +1,4 @@
-"""Whatever the user gives wrongly: one line that names it, exit code 2, and nothing written or changed."""
+"""Every wrong input gives one line that names it, exit code 2, and writes or changes nothing."""
 
 import json
 import shutil
@@ -35,7 +35,7 @@ def photos(boulder, tmp_path):
     return folder
 
 
-def cut_short(path):
+def truncated(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return path
 
@@ -67,22 +67,22 @@ def test_a_single_photo_to_build(refused, photos, tmp_path):
 
 def test_a_text_file_named_jpg(refused, boulder, photos, tmp_path):
     bad = photos / "text.jpg"
-    bad.write_text("this is no image")
+    bad.write_text("this is not an image")
     refused("build", photos, "-o", tmp_path / "map", naming=bad)
     refused("localize", boulder.map_path, photos, "-o", tmp_path / "poses.json", naming=bad)
     refused("localize", boulder.map_path, bad, "-o", tmp_path / "poses.json", naming=bad)
     refused("benchmark", "images", photos, "-o", tmp_path / "results", naming=bad)
 
 
-def test_an_image_cut_short(refused, boulder, photos, tmp_path):
-    bad = cut_short(photos / "12.png")
+def test_a_truncated_image(refused, boulder, photos, tmp_path):
+    bad = truncated(photos / "12.png")
     refused("build", photos, "-o", tmp_path / "map", naming=bad)
     refused("localize", boulder.map_path, bad, "-o", tmp_path / "poses.json", naming=bad)
 
 
 @pytest.mark.parametrize("part", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_model_cut_short(refused, a_map, tmp_path, part):
-    bad = cut_short(a_map / "sparse" / part)
+def test_a_truncated_model(refused, a_map, tmp_path, part):
+    bad = truncated(a_map / "sparse" / part)
     features = ("--features", a_map / "features.h5")
     refused("import", a_map / "sparse", "-o", tmp_path / "new", *features, naming=bad)
     refused("reduce", a_map, "-o", tmp_path / "slim", naming=bad)
@@ -91,8 +91,8 @@ def test_a_model_cut_short(refused, a_map, tmp_path, part):
 
 
 @pytest.mark.parametrize("part", ["features.h5", "map.json"])
-def test_another_part_of_a_map_cut_short_or_missing(refused, a_map, tmp_path, part):
-    cut_short(a_map / part)
+def test_another_part_of_a_map_truncated_or_missing(refused, a_map, tmp_path, part):
+    truncated(a_map / part)
     refused("info", a_map, naming=a_map / part)
     (a_map / part).unlink()
     refused("reduce", a_map, "-o", tmp_path / "slim", naming=a_map)
@@ -113,7 +113,7 @@ def test_a_missing_map(refused, boulder, tmp_path):
     refused("info", boulder.queries / "0.png", naming="not a map")
 
 
-def test_images_that_do_not_hold_all_of_the_model(refused, boulder, photos, tmp_path):
+def test_images_that_lack_some_of_the_model(refused, boulder, photos, tmp_path):
     arguments = (boulder.map_path / "sparse", "-o", tmp_path / "map", "--images", photos)
     refused("import", *arguments, naming=photos)
     refused("import", *arguments[:-1], tmp_path / "missing", naming=tmp_path / "missing")
@@ -251,7 +251,7 @@ def test_missing_arguments(refused, command):
     refused(command, naming=f"see slimsfm {command} --help")
 
 
-def test_outputs_of_no_known_format(refused, boulder, tmp_path):
+def test_outputs_of_an_unknown_format(refused, boulder, tmp_path):
     output = tmp_path / "poses.xml"
     refused("localize", boulder.map_path, boulder.queries, "-o", output, naming=output)
 
@@ -278,7 +278,7 @@ def test_an_output_in_a_file(refused, boulder, tmp_path):
     refused("reduce", boulder.map_path, "-o", output, naming=output)
 
 
-def test_an_output_never_replaces_what_it_is_made_of(refused, a_map, photos, tmp_path):
+def test_an_output_never_replaces_its_input(refused, a_map, photos, tmp_path):
     for output in (a_map, tmp_path, a_map / ".." / "map"):
         refused("reduce", a_map, "-o", output, "--overwrite", naming=output)
     link = tmp_path / "link"
@@ -306,7 +306,7 @@ def test_a_bad_camera_file(refused, boulder, tmp_path):
     refused(*images, "--camera", camera, naming="320x240")
 
 
-def test_an_image_whose_focal_length_nobody_knows(refused, boulder, tmp_path):
+def test_an_image_of_unknown_focal_length(refused, boulder, tmp_path):
     upright = tmp_path / "upright.png"
     Image.new("RGB", (240, 320)).save(upright)
     refused("localize", boulder.map_path, upright, "-o", tmp_path / "poses.json", naming="--camera FILE")

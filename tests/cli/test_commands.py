@@ -1,6 +1,8 @@
 """The whole path through the command line, on one small rendered object."""
 
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,13 +21,14 @@ from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 
-def assert_done(outcome, made, next_command):
-    """A command ends with what it made, in which time, and with what to do next."""
+def assert_done(outcome, made, next_command=None):
+    """A command ends with what it made and how long that took, and with what to do next."""
     assert (outcome.code, outcome.err.strip()) == (0, "")
-    *_, last, next_line = outcome.out.splitlines()
-    assert last.startswith(str(made))
-    assert last.endswith(" s")
-    assert next_line.startswith(f"next: slimsfm {next_command} ")
+    lines = outcome.out.splitlines()
+    if next_command:
+        assert lines.pop().startswith(f"next: slimsfm {next_command} ")
+    assert lines[-1].startswith(str(made))
+    assert lines[-1].endswith(" s")
 
 
 def poses_of(path):
@@ -42,7 +45,7 @@ def poses_of(path):
 
 def test_synthesize(boulder):
     assert_done(boulder.synthesize, boulder.folder / "objects", "build")
-    assert f"1 objects, {MAPPING_FRAMES + QUERY_FRAMES} frames" in boulder.synthesize.out
+    assert f"1 object, {MAPPING_FRAMES + QUERY_FRAMES} frames" in boulder.synthesize.out
     assert len(list(boulder.photos.iterdir())) == MAPPING_FRAMES
     assert len(list(boulder.queries.iterdir())) == QUERY_FRAMES
     assert sorted(path.name for path in (boulder.folder / "objects").iterdir()) == [NAME]
@@ -64,9 +67,23 @@ def test_build_and_info(boulder, tmp_path):
     sizes = {name: size for name, size in facts["bytes"].items() if name != "total"}
     assert facts["bytes"]["total"] == sum(sizes.values()) > 0
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
-    told = slimsfm("info", tmp_path / "map", "--images").out
-    assert all(name in told for name in facts["images"])
+    listed = slimsfm("info", tmp_path / "map", "--images").out
+    assert all(name in listed for name in facts["images"])
     assert facts["images"][0] not in slimsfm("info", tmp_path / "map").out
+
+
+def test_info_says_what_kind_of_map_it_is(boulder, tmp_path):
+    small = tmp_path / "small"
+    arguments = ("--max-points", 60, "--selector", "kcover")
+    assert slimsfm("reduce", boulder.map_path, "-o", small, *arguments).code == 0
+    said = slimsfm("info", small).out
+    assert re.search(r"^kind +points for direct matching, reduced from a full map$", said, re.MULTILINE)
+    assert re.search(r"^points +60 points$", said, re.MULTILINE)
+    assert "observation" not in said
+    full = slimsfm("info", boulder.map_path).out
+    assert re.search(r"^kind +images with local features$", full, re.MULTILINE)
+    assert re.search(r"^box +given, diagonal \d\.\d+ metre$", full, re.MULTILINE)
+    assert re.search(r"mean reprojection error \d\.\d\d px", full)
 
 
 def test_reduce_keeps_a_dominating_set(boulder, reduced):
@@ -81,7 +98,7 @@ def test_reduce_keeps_a_dominating_set(boulder, reduced):
 
 
 def _never(_items, label):
-    raise AssertionError(f"{label}: computed though it was there")
+    raise AssertionError(f"{label}: computed although it is stored")
 
 
 def test_another_threshold_reuses_the_graph(reduced, boulder, tmp_path):
@@ -117,7 +134,7 @@ def test_localize_references_in_full_and_slim_map(boulder, tmp_path, strategy):
     for map_path in (boulder.map_path, slim):
         output = tmp_path / f"{map_path.name}.json"
         done = slimsfm("localize", map_path, photos, "-o", output, "--strategy", strategy)
-        assert_done(done, output, "info")
+        assert_done(done, output)
         found = poses_of(output)
         errors = [
             corner_error(pose, truth.images[name].cam_from_world(), truth.box) for name, pose in found.items()
@@ -132,8 +149,8 @@ def test_localize_one_image_with_its_camera(boulder, tmp_path):
     (tmp_path / "camera.txt").write_text(line)
     one, output = boulder.photos / "12.png", tmp_path / "pose.csv"
     done = slimsfm("localize", boulder.map_path, one, "-o", output, "--camera", tmp_path / "camera.txt")
-    assert_done(done, output, "info")
-    assert "1 of 1 images localized" in done.out
+    assert_done(done, output)
+    assert "1 of 1 image localized" in done.out
     assert len(output.read_text().splitlines()) == 2
 
 
@@ -147,11 +164,11 @@ def test_any_number_of_workers_gives_the_same_poses(boulder, tmp_path):
     assert found[0]
 
 
-def test_several_objects_are_sought_at_once(boulder, tmp_path):
+def test_several_objects_are_found_at_once(boulder, tmp_path):
     twin = shutil.copytree(boulder.map_path, tmp_path / "twin")
     output = tmp_path / "poses.json"
     done = slimsfm("localize", boulder.map_path, boulder.queries, "-o", output, "--also", twin)
-    assert_done(done, output, "info")
+    assert_done(done, output)
     rows = json.loads(output.read_text())["images"]
     assert [row["object"] for row in rows] == ["map", "twin"] * QUERY_FRAMES
     for one, other in zip(rows[::2], rows[1::2], strict=True):
@@ -185,7 +202,7 @@ def test_an_unknown_focal_length_is_estimated(boulder, tmp_path):
     assert row["focal_length_px"] == pytest.approx(boulder.map.shared_camera.mean_focal_length(), rel=0.03)
 
 
-def test_gravity_is_read_and_must_fit(boulder, tmp_path):
+def test_gravity_must_agree_with_the_pose(boulder, tmp_path):
     path = boulder.mapping.image_paths[12]
     down = boulder.map.images[path.name].cam_from_world().rotation.matrix() @ [0.0, 0.0, -1.0]
     gravity = tmp_path / "gravity.json"
@@ -202,14 +219,14 @@ def test_gravity_is_read_and_must_fit(boulder, tmp_path):
     assert not (tmp_path / "x.json").exists()
 
 
-def test_what_shows_nothing_of_the_object_is_not_localized(boulder, tmp_path):
+def test_images_without_the_object_are_not_localized(boulder, tmp_path):
     folder = tmp_path / "queries"
     folder.mkdir()
     Image.new("RGB", (320, 240)).save(folder / "black.png")
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     Image.fromarray(noise).save(folder / "noise.png")
     done = slimsfm("localize", boulder.map_path, folder, "-o", tmp_path / "poses.json")
-    assert_done(done, tmp_path / "poses.json", "info")
+    assert_done(done, tmp_path / "poses.json")
     assert "black.png: not localized" in done.out
     assert "noise.png: not localized" in done.out
     assert "0 of 2 images localized" in done.out
@@ -233,23 +250,87 @@ def test_overwrite_replaces_the_whole_map(boulder, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)], ids=str)
-def test_without_a_command_all_are_named(arguments):
+def test_without_a_command_all_are_listed(arguments):
     outcome = slimsfm(*arguments)
     assert (outcome.code, outcome.err) == (0, "")
-    assert all(name in outcome.out for name in COMMANDS)
+    assert all(f"  {name.split()[0]} " in outcome.out for name in COMMANDS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command):
-    outcome = slimsfm(command, "--help")
+    outcome = slimsfm(*command.split(), "--help")
     assert (outcome.code, outcome.err) == (0, "")
-    assert outcome.out.startswith(f"usage: slimsfm {command}")
+    assert outcome.out.startswith(f"usage: slimsfm {command} ")
 
 
-def test_it_runs_as_a_module_of_its_own():
+def test_the_package_runs_as_a_module():
     found = subprocess.run([sys.executable, "-m", "slimsfm", "--version"], capture_output=True, text=True)
     assert (found.returncode, found.stderr) == (0, "")
     assert found.stdout.startswith("slimsfm ")
     unknown = subprocess.run([sys.executable, "-m", "slimsfm", "shrink"], capture_output=True, text=True)
     assert (unknown.returncode, unknown.stdout) == (2, "")
-    assert unknown.stderr.startswith("slimsfm: 'shrink' is no command")
+    assert unknown.stderr.startswith("slimsfm: 'shrink' is not a command; choose one of build, import, ")
+
+
+AND_NAME_LIBRARIES = """
+import sys
+from slimsfm.cli import main
+try:
+    main()
+finally:
+    libraries = ("numpy", "pycolmap", "scipy", "rich", "cv2")
+    print([one for one in libraries if hasattr(sys.modules.get(one), "__file__")], file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_the_same_without_the_libraries(command):
+    """A process that only prints help imports none of them, and says what it says with all of them."""
+    arguments = [sys.executable, "-c", AND_NAME_LIBRARIES, *command.split(), "--help"]
+    found = subprocess.run(arguments, capture_output=True, text=True)
+    assert (found.returncode, found.stderr) == (0, "[]\n")
+    assert found.stdout == slimsfm(*command.split(), "--help").out
+
+
+def test_help_groups_what_is_rarely_needed_and_shows_no_none():
+    said = slimsfm("localize", "--help").out
+    main, advanced = said.split("\nadvanced:\n")
+    assert "None" not in said
+    assert "--camera PATH" in main
+    assert "--max-iterations N" in advanced
+    assert "(default: auto)" in main
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (("biuld",), "'biuld' is not a command; did you mean build?"),
+        (("benchmark", "image"), "'image' is not a subcommand of benchmark; did you mean images?"),
+        (("export", "onx"), "'onx' is not a subcommand of export; did you mean onnx?"),
+        (("localize", "--cmera", "x"), "--cmera is not an option; did you mean --camera?"),
+    ],
+    ids=str,
+)
+def test_a_misspelled_word_is_answered_by_the_nearest(typed, meant):
+    outcome = slimsfm(*typed)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith(f"slimsfm: {meant}")
+    assert len(outcome.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", ["localize --help", "--help", "methods"])
+def test_a_reader_that_stops_early_sees_no_traceback(arguments):
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "slimsfm", *arguments.split()]
+    found = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert found.stderr == ""
+    assert found.returncode == 141
+
+
+def test_options_may_be_written_with_underscores_and_equal_signs(boulder, tmp_path):
+    output = tmp_path / "poses.csv"
+    arguments = (boulder.photos / "12.png", f"--output={output}", "--min_confidence=0.6")
+    assert slimsfm("localize", boulder.map_path, *arguments).code == 0
+    assert len(output.read_text().splitlines()) == 2

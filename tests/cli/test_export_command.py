@@ -20,16 +20,16 @@ def weights(tmp_path, monkeypatch):
     folder = tmp_path / "weights"
     folder.mkdir()
     torch.save(network.state_dict(), folder / "superpoint_v1.pth")
-    monkeypatch.setenv(FOLDER, str(folder))  # put back what --weights sets for the process
+    monkeypatch.setenv(FOLDER, str(folder))  # restores what --weights sets for the process
     return folder
 
 
-def test_a_file_is_written_and_what_to_do_with_it_said(weights):
+def test_a_file_is_written_and_its_use_explained(weights):
     path = weights / "superpoint.onnx"
     outcome = slimsfm("export", "onnx", "superpoint", "-o", path, "--weights", weights)
     assert outcome.code == 0, outcome.err
     assert f"{path}: superpoint, " in outcome.out
-    assert "runs superpoint on the CPU as superpoint.onnx in the folder of weights" in outcome.out
+    assert "put it into the folder of weights as superpoint.onnx" in outcome.out
     assert sorted(contents(weights)) == ["superpoint.onnx", "superpoint_v1.pth"]
     again = slimsfm("export", "onnx", "superpoint", "-o", path)
     assert again.code == 2
@@ -37,7 +37,7 @@ def test_a_file_is_written_and_what_to_do_with_it_said(weights):
 
 
 @pytest.mark.parametrize("method", ["superglue", "onepose", "nonsense"])
-def test_what_cannot_be_exported_is_told_with_what_can(tmp_path, method):
+def test_a_method_that_cannot_be_exported_is_answered_by_those_that_can(tmp_path, method):
     outcome = slimsfm("export", "onnx", method, "-o", tmp_path / "x.onnx")
     assert outcome.code == 2
     assert len(outcome.err.splitlines()) == 1
@@ -54,5 +54,5 @@ def test_a_folder_is_not_replaced_by_a_file(weights):
     assert contents(weights) == before
 
 
-def test_methods_are_called_as_their_weights_are():
+def test_methods_have_the_names_of_their_weights():
     assert EXPORTABLE.keys() < WEIGHTS.keys()

@@ -34,7 +34,7 @@ def test_a_slim_map_is_exported_with_the_pairs_of_its_queries(map_path, queries,
     assert not (out / "pairs-queries.txt").exists()
 
 
-def test_what_was_exported_is_imported_again(map_path, tmp_path):
+def test_an_exported_map_can_be_imported_again(map_path, tmp_path):
     out, back = tmp_path / "out", tmp_path / "back"
     assert slimsfm("export", "hloc", map_path, "-o", out).code == 0
     files = ("--features", out / "features.h5", "--matches", out / "matches.h5")
@@ -43,22 +43,19 @@ def test_what_was_exported_is_imported_again(map_path, tmp_path):
     assert contents(back)["matches.h5"] == contents(map_path)["matches.h5"]
 
 
-def test_wrong_inputs_are_told_in_one_line(map_path, queries, tmp_path):
+def test_wrong_inputs_are_reported_in_one_line(map_path, queries, tmp_path):
     direct = tmp_path / "direct"
     assert slimsfm("reduce", map_path, "-o", direct, "--max-points", 60, "--selector", "kcover").code == 0
     (tmp_path / "own.txt").write_text("003.png\n")
     before = contents(tmp_path)
     out = ("-o", tmp_path / "out")
     for arguments, naming in (
-        ((direct, *out), "reduced for matching images"),
+        ((direct, *out), "reduce the full map for images instead"),
         ((tmp_path / "nowhere", *out), f"{tmp_path / 'nowhere'}: not a map"),
         ((map_path, *out, "--queries", tmp_path / "nobody"), f"{tmp_path / 'nobody'}: neither a folder"),
-        (
-            (map_path, *out, "--queries", tmp_path / "own.txt"),
-            "'003.png' has the name of an image",
-        ),
-        ((map_path, "-o", map_path, "--overwrite"), "is or holds the input"),
-        ((map_path, "-o", queries, "--queries", queries, "--overwrite"), "is or holds the input"),
+        ((map_path, *out, "--queries", tmp_path / "own.txt"), "'003.png' is called as an image of the map"),
+        ((map_path, "-o", map_path, "--overwrite"), "is or contains the input"),
+        ((map_path, "-o", queries, "--queries", queries, "--overwrite"), "is or contains the input"),
         ((map_path,), "see slimsfm export hloc --help"),
     ):
         outcome = slimsfm("export", "hloc", *arguments)
@@ -69,15 +66,16 @@ def test_wrong_inputs_are_told_in_one_line(map_path, queries, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["superpoint", "colmap"])
-def test_an_unknown_kind_is_told_with_those_there_are(tmp_path, kind):
+def test_an_unknown_kind_is_answered_by_the_known_ones(tmp_path, kind):
     outcome = slimsfm("export", kind, "-o", tmp_path / "x")
     assert outcome.code == 2
-    assert outcome.err == f"slimsfm: {kind!r} is no kind of export; there is onnx, hloc\n"
+    assert outcome.err == f"slimsfm: {kind!r} is not a subcommand of export; choose one of onnx, hloc\n"
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)], ids=str)
-def test_both_kinds_are_named(arguments):
+def test_both_kinds_are_listed(arguments):
     outcome = slimsfm("export", *arguments)
     assert outcome.code == 0
-    assert "slimsfm export onnx METHOD -o FILE" in outcome.out
-    assert "slimsfm export hloc MAP -o OUT" in outcome.out
+    assert outcome.out.startswith("usage: slimsfm export ")
+    assert "  export onnx " in outcome.out
+    assert "  export hloc " in outcome.out

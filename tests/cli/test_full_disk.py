@@ -1,4 +1,4 @@
-"""A disk that fills up while a result is written: one line, exit code 2, and no half of a result."""
+"""A disk that fills up while a result is written: one line, exit code 2, and no incomplete result."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from commands import without_progress
+from commands import messages
 
 needs_root = pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() != 0 or shutil.which("mount") is None,
@@ -22,7 +22,7 @@ def disk(folder, kilobytes):
     size = f"size={kilobytes}k"
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder], capture_output=True)
     if mounted.returncode:
-        pytest.skip("needs leave to mount a small disk")
+        pytest.skip("needs permission to mount a small disk")
     try:
         yield folder
     finally:
@@ -30,11 +30,11 @@ def disk(folder, kilobytes):
 
 
 def refused_for_space(*arguments):
-    """In a process of its own, for what fails in COLMAP's code may end it."""
+    """In its own process, because a failure in COLMAP's code may end it."""
     found = subprocess.run(
         [sys.executable, "-m", "slimsfm", *map(str, arguments)], capture_output=True, text=True
     )
-    lines = [line for line in without_progress(found.stderr).splitlines() if line.strip()]
+    lines = messages(found.stderr)
     assert (found.returncode, len(lines)) == (2, 1), found.stderr
     assert "No space left on device" in lines[0]
     return lines[0]
@@ -46,7 +46,7 @@ def size_of(path):
 
 @needs_root
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.9], ids=["empty", "in the model", "in the features"])
-def test_a_map_is_whole_or_not_there(boulder, tmp_path, share):
+def test_a_map_is_complete_or_absent(boulder, tmp_path, share):
     names = sorted(boulder.map.images)
     parts = [size_of(boulder.map_path / part) for part in ("sparse", "features.h5")]
     sizes = {0.05: 8192, 0.5: 0.5 * parts[0], 0.9: parts[0] + 0.5 * parts[1]}
@@ -57,7 +57,7 @@ def test_a_map_is_whole_or_not_there(boulder, tmp_path, share):
 
 
 @needs_root
-def test_poses_are_whole_or_not_there_and_those_there_stay(boulder, tmp_path):
+def test_poses_are_complete_or_absent_and_existing_ones_stay(boulder, tmp_path):
     with disk(tmp_path / "disk", 8) as folder:
         (folder / "poses.json").write_text("mine")
         (folder / "filler").write_bytes(bytes(4096))
@@ -69,7 +69,7 @@ def test_poses_are_whole_or_not_there_and_those_there_stay(boulder, tmp_path):
 
 
 @needs_root
-def test_a_graph_is_whole_or_not_there(boulder, tmp_path):
+def test_a_graph_is_complete_or_absent(boulder, tmp_path):
     needed = sum(
         (file.stat().st_size // 4096 + 1) * 4 for file in boulder.map_path.rglob("*") if file.is_file()
     )

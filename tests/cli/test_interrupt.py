@@ -1,4 +1,4 @@
-"""Ctrl-C, or the system's wish to end: exit code 130, and nothing half-made is left behind."""
+"""Ctrl-C or SIGTERM: exit code 130 and no incomplete output."""
 
 import os
 import shutil
@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from commands import contents, slimsfm, without_progress
+from commands import contents, messages, slimsfm
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
-PATIENCE_S = 20
-GOES_ON = "the same command goes on where it stopped"
+PATIENCE_S = 60
+GOES_ON = "run the same command again to resume"
 
 
 @pytest.fixture
 def start(tmp_path):
-    """Starts the command in a process of its own, whose temporary files lie in a folder of the test."""
+    """Starts the command in its own process, whose temporary files are in a folder of the test."""
     (tmp_path / "tmp").mkdir()
     processes = []
 
@@ -53,7 +53,7 @@ def opened(process):
         try:
             names.add(os.readlink(link))
         except OSError:
-            continue  # closed meanwhile
+            continue  # closed in the meantime
     return names
 
 
@@ -70,16 +70,14 @@ def wait_until_localizing(process, a_map):
     wait_until(process, lambda: str(partial) in opened(process) and partial.stat().st_size >= 65)
 
 
-def assert_interrupted(process, how, tmp_path, what_now="nothing half-made was left behind"):
+def assert_interrupted(process, how, tmp_path, what_now="no incomplete output was left behind"):
     if how == signal.SIGINT:
         os.killpg(process.pid, how)  # as a terminal does
     else:
         process.send_signal(how)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130, (out, err)
-    assert [line for line in without_progress(err).splitlines() if line.strip()] == [
-        f"slimsfm: interrupted; {what_now}"
-    ]
+    assert messages(err) == [f"slimsfm: interrupted; {what_now}"]
     assert list((tmp_path / "tmp").iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""Learned methods on the command line: what is there, what is missing, and that nothing else needs them."""
+"""Learned methods on the command line: what is found, what is missing, and that nothing else needs them."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from commands import slimsfm
+from commands import messages, slimsfm
 from slimsfm.weights import FOLDER
 
 WITHOUT = """
@@ -38,7 +38,7 @@ def environment_is_put_back(monkeypatch):
         monkeypatch.delenv(name)
 
 
-def test_methods_are_listed_with_licences_and_what_is_found(tmp_path):
+def test_methods_are_listed_with_licenses_and_found_weights(tmp_path):
     (tmp_path / "depth-save.pth").write_bytes(b"")
     (tmp_path / "aliked-n16.pth").write_bytes(b"")
     found = slimsfm("methods", "--weights", tmp_path)
@@ -56,7 +56,7 @@ def test_methods_are_listed_with_licences_and_what_is_found(tmp_path):
     }
     assert "research only" in lines["superpoint"]
     assert lines["disk"].rstrip().endswith("yes")
-    assert "another file of that name" in lines["aliked"]
+    assert "another file has this name" in lines["aliked"]
 
 
 def test_classical_methods_need_no_network_stack(boulder, tmp_path):
@@ -93,17 +93,17 @@ def test_an_unknown_extractor_or_matcher_or_folder_is_named(boulder, tmp_path):
     assert not out.exists()
 
 
-def test_missing_weights_are_named_before_anything_is_written(boulder, tmp_path, monkeypatch):
-    loading = pytest.importorskip("slimsfm.networks.loading", exc_type=ImportError)
-    monkeypatch.setattr(loading, "_from_hugging_face", lambda _address: None)
-    monkeypatch.setattr(loading, "_from_address", lambda _address: None)
-    found = slimsfm(
-        "build", boulder.photos, "-o", tmp_path / "map", "--extractor", "superpoint", "--weights", tmp_path
+def test_missing_weights_are_named_before_anything_is_written(boulder, tmp_path):
+    pytest.importorskip("slimsfm.networks.loading", exc_type=ImportError)
+    out, cache = tmp_path / "map", tmp_path / "cache"
+    options = ("-o", out, "--extractor", "superpoint", "--weights", tmp_path)
+    found = subprocess.run(
+        [sys.executable, "-m", "slimsfm", *map(str, ("build", boulder.photos, *options))],
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(cache)},
+        capture_output=True,
+        text=True,
     )
-    assert found.code == 2
-    assert (
-        "weights superpoint_v1.pth are missing and could not be downloaded; get them from the SuperGlue"
-        in found.err
-    )
-    assert "license Magic Leap: research only, put the file into a folder" in found.err
-    assert not (tmp_path / "map").exists()
+    assert found.returncode == 2
+    (line,) = messages(found.stderr)
+    assert "weights superpoint_v1.pth are missing; get them from the SuperGluePretrainedNetwork" in line
+    assert not out.exists()

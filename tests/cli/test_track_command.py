@@ -1,4 +1,4 @@
-"""`slimsfm track`, on short films of one rendered object."""
+"""`slimsfm track` on short videos of one rendered object."""
 
 import json
 import shutil
@@ -9,16 +9,16 @@ import pytest
 from PIL import Image
 
 from commands import contents, slimsfm
-from slimsfm.cli.track_command import _drawn
 from slimsfm.localization import Localizer
 from slimsfm.photos import read_image
+from slimsfm.report.tracked_video import draw_tracked
 from slimsfm.tracking import Tracker, TrackerOptions
 from slimsfm.tracking.video import open_frames, write_video
 
 
 @pytest.fixture(scope="module")
 def images(boulder):
-    """A still camera, nothing to see, and the object from elsewhere."""
+    """The object from a still camera, a black frame, and the object from another viewpoint."""
     here, there = (read_image(boulder.photos / name) for name in ("12.png", "20.png"))
     return [here, here, here, np.zeros_like(here), there, there]
 
@@ -63,15 +63,14 @@ def as_json(cam_from_world):
     }
 
 
-def test_the_command_gives_the_poses_of_the_library(boulder, video, tmp_path):
+def test_the_command_writes_the_poses_of_the_library(boulder, video, tmp_path):
     output = tmp_path / "poses.json"
     done = slimsfm("track", boulder.map_path, video, "-o", output)
     assert (done.code, done.err.strip()) == (0, "")
-    told, made, next_line = done.out.splitlines()
-    assert f"{output}: 3 frames tracked, 2 localized on their own, 1 lost; " in told
-    assert told.endswith(" frames a second")
+    summary, made = done.out.splitlines()
+    assert f"{output}: 3 frames tracked, 2 localized from scratch, 1 lost; " in summary
+    assert summary.endswith(" frames per second")
     assert made.startswith(f"{output}: 6 frames in ")
-    assert next_line == f"next: slimsfm info {boulder.map_path}"
     poses = poses_of(output)
     assert poses == library_poses(boulder.map, video)
     assert [name for name, pose in poses.items() if pose is None] == ["000003"]
@@ -103,12 +102,12 @@ def test_a_folder_is_tracked_image_by_image(boulder, images, tmp_path):
         Image.fromarray(image).save(folder / f"{i}.png")
     done = slimsfm("track", boulder.map_path, folder, "-o", tmp_path / "poses.csv")
     assert done.code == 0
-    assert "2 frames tracked, 1 localized on their own, 0 lost" in done.out
+    assert "2 frames tracked, 1 localized from scratch, 0 lost" in done.out
     names = [line.split(",")[0] for line in (tmp_path / "poses.csv").read_text().splitlines()]
     assert names == ["name", "0.png", "1.png", "2.png"]
 
 
-def test_a_camera_file_is_heeded(boulder, video, tmp_path):
+def test_a_camera_file_is_used(boulder, video, tmp_path):
     line = "1 PINHOLE 640 480 780 780 320 240\n"
     (tmp_path / "camera.txt").write_text(line)
     arguments = (boulder.map_path, video, "--camera", tmp_path / "camera.txt")
@@ -120,7 +119,7 @@ def test_a_camera_file_is_heeded(boulder, video, tmp_path):
     assert other > 1.1 * own
 
 
-def test_the_box_is_drawn_where_the_pose_is_sure(boulder, video, images, tmp_path):
+def test_the_box_is_drawn_where_the_object_is_found(boulder, video, images, tmp_path):
     drawn = tmp_path / "drawn.mp4"
     done = slimsfm("track", boulder.map_path, video, "-o", tmp_path / "poses.json", "--video", drawn)
     assert done.code == 0
@@ -132,7 +131,7 @@ def test_the_box_is_drawn_where_the_pose_is_sure(boulder, video, images, tmp_pat
     assert changes[3].max() < 30  # lost: no box
 
 
-def test_the_surer_a_pose_the_stronger_its_box(boulder, images):
+def test_a_more_confident_pose_has_a_stronger_box(boulder, images):
     map_ = boulder.map
     camera = map_.shared_camera
     (sure,) = [Tracker(Localizer(map_)).track(images[0])]
@@ -142,7 +141,7 @@ def test_the_surer_a_pose_the_stronger_its_box(boulder, images):
             cam_from_world=sure.pose.cam_from_world, inliers=sure.pose.inliers, confidence=confidence
         )
         one = sure.__class__(localization=_with_pose(sure.localization, pose), state="tracked", seconds=0.1)
-        drawn = _drawn(images[0], one, map_.box, camera)
+        drawn = draw_tracked(images[0], one, map_.box, camera)
         changes.append(np.abs(drawn.astype(int) - images[0]).sum())
     assert changes[0] > 1.5 * changes[1] > 2 * changes[2] > 0
 
@@ -152,7 +151,7 @@ def _with_pose(localization, pose):
 
 
 class FakeCamera:
-    """Shows some pictures, and then somebody presses Ctrl-C."""
+    """Yields some images, then raises what Ctrl-C raises."""
 
     def __init__(self, images):
         self.images = [cv2.cvtColor(image, cv2.COLOR_RGB2BGR) for image in images]
@@ -172,7 +171,7 @@ class FakeCamera:
         pass
 
 
-def test_ctrl_c_ends_what_a_camera_shows_and_keeps_it(boulder, images, tmp_path, monkeypatch):
+def test_ctrl_c_ends_a_live_camera_and_keeps_its_poses(boulder, images, tmp_path, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda _index: FakeCamera(images[:3]))
     arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "seen.mp4")
     done = slimsfm("track", boulder.map_path, 0, *arguments)
@@ -224,18 +223,27 @@ def test_bad_maps_outputs_and_options(refused, boulder, video, tmp_path):
     refused(boulder.map_path, video, naming="see slimsfm track --help")
     for option, value, naming in (
         ("--smoothing", -1, "smoothing must not be negative, got -1.0"),
-        ("--focal", "unknown", "give --camera FILE"),
+        ("--focal", "unknown", "use --focal known and --camera FILE"),
         ("--lag", 0, "lag must be at least 1, got 0"),
         ("--camera", tmp_path / "missing.txt", "missing.txt"),
     ):
         refused(boulder.map_path, video, "-o", output, option, value, naming=naming)
 
 
+def test_weights_are_an_option(refused, boulder, video, tmp_path, monkeypatch):
+    monkeypatch.setenv("SLIMSFM_WEIGHTS", "")
+    arguments = ("-o", tmp_path / "poses.json", "--weights", tmp_path / "none", "--device", "cpu")
+    refused(boulder.map_path, video, *arguments, naming="none: no such folder of weights")
+
+
 def test_a_camera_of_another_shape(refused, boulder, video, tmp_path):
     (tmp_path / "camera.txt").write_text("1 PINHOLE 240 320 300 300 120 160\n")
     arguments = ("-o", tmp_path / "poses.json", "--camera", tmp_path / "camera.txt")
     refused(
-        boulder.map_path, video, *arguments, naming=f"{video}: 320x240 pixels, is not of --camera 240x320"
+        boulder.map_path,
+        video,
+        *arguments,
+        naming=f"{video}: 320x240 pixels, but the given camera",
     )
     with write_video(tmp_path / "upright.mp4", 25.0) as write:
         write(np.zeros((320, 240, 3), np.uint8))

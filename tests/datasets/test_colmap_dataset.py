@@ -165,7 +165,7 @@ def test_photos_that_differ_in_size_from_the_camera_are_an_error(project, making
 
 
 def test_too_frequent_queries_and_unknown_names_are_errors(project, making):
-    with pytest.raises(InputError, match="query_every 1 leaves 0 references of 9 images"):
+    with pytest.raises(InputError, match="`query_every=1` leaves 0 references of 9 images"):
         replace(project, query_every=1).load("cup", making)
     with pytest.raises(InputError, match="has no object '0'; it has cup"):
         project.load("0", making)

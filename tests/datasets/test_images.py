@@ -21,7 +21,7 @@ def test_every_third_from_the_first_is_a_query():
     ids=str,
 )
 def test_two_references_and_a_query_are_required(names, every):
-    with pytest.raises(InputError, match=f"query_every {every}"):
+    with pytest.raises(InputError, match=f"`query_every={every}`"):
         query_names(names, every)
 
 

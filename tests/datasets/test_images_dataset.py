@@ -94,7 +94,7 @@ def test_the_current_folder_has_its_own_name(photos, monkeypatch):
 
 @pytest.mark.parametrize("every", [0, 1])
 def test_too_frequent_queries_are_an_error_before_any_work(photos, making, every):
-    with pytest.raises(InputError, match=f"query_every {every} leaves"):
+    with pytest.raises(InputError, match=f"`query_every={every}` leaves"):
         Images(path=photos, query_every=every).load("box", making)
     assert not making.folder.exists()
 

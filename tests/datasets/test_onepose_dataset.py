@@ -80,7 +80,7 @@ def test_a_folder_of_splits_and_an_unknown_object_are_errors(published, making):
 
 def test_missing_full_frames_are_an_error_that_mentions_crops(tmp_path, known, making, write_onepose):
     write_onepose(tmp_path / NAME, known, 2, CROPS)
-    with pytest.raises(InputError, match=r"color_full is missing: .*frames: cropped"):
+    with pytest.raises(InputError, match=r"color_full is missing: .*`frames='cropped'`"):
         OnePose(path=tmp_path).load(NAME, making)
     assert OnePose(path=tmp_path, frames="cropped").load(NAME, making).mapping.names == ("0.png",)
 
@@ -89,7 +89,7 @@ def test_a_video_with_more_frames_than_poses_is_an_error(published, making, writ
     extra = published.path / NAME / "colorbox-1" / "color_full" / "17.png"
     write_image(extra, 96, 72)
     with pytest.raises(
-        InputError, match=r"17\.png has no pose in poses_ba: .*18 frames.*17 .*frames: cropped"
+        InputError, match=r"17\.png has no pose in poses_ba: .*18 frames.*17 .*`frames='cropped'`"
     ):
         published.load(NAME, making)
     assert len(replace(published, frames="cropped").load(NAME, making).mapping.names) == 4

@@ -25,15 +25,15 @@ DOCS = ROOT / "docs"
 FILM, FRAMES = (
     160,
     15,
-)  # frames all around the object, and those of them that are rendered
-FRAMES_PER_SECOND = 4.0  # so that two frames a second are the photos
+)  # frames around the object, and how many of them are rendered
+FRAMES_PER_SECOND = 4.0  # two frames per second are the photos
 NEW = (5, 11)
 
 
 @pytest.fixture(scope="session")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as the how-tos want it: `photos/`, `new/` and `video.mp4` of a rendered object."""
-    pytest.importorskip("av", reason="needs PyAV to film, which is not installed")
+    """A folder as the how-to guides need it: `photos/`, `new/` and `video.mp4` of a rendered object."""
+    pytest.importorskip("av", reason="needs PyAV, which is not installed")
     folder = tmp_path_factory.mktemp("filmed")
     take = mapping_take("printed_box", FILM, 320, 240, seed=0)
     frames = [take.frame(index) for index in range(FRAMES)]
@@ -54,7 +54,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def hook() -> Callable[[str], ModuleType]:
-    """Loads a hook of the site, as mkdocs does, by the name of its file."""
+    """Loads a hook of the site by the name of its file, as mkdocs does."""
 
     def load(name: str) -> ModuleType:
         for needed in ("mkdocs", "latex2mathml"):
@@ -71,7 +71,7 @@ def hook() -> Callable[[str], ModuleType]:
 
 @pytest.fixture(scope="session")
 def projects(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is made of the photos: `map`, COLMAP's `project/`, hloc's `outputs/` and `queries.txt`, a box."""
+    """Files made from the photos: `map`, COLMAP's `project/`, hloc's `outputs/` and `queries.txt`, a box."""
     folder = tmp_path_factory.mktemp("projects")
     with quiet():
         made = build_map(filmed / "photos", workspace=folder / "work")
@@ -90,7 +90,7 @@ def projects(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _write_database(working: Path, made: Map, path: Path) -> None:
-    """The working database of a map as COLMAP would have left it, with the images' names."""
+    """The database of a map as COLMAP writes it, with the names of the images."""
     working.rename(path)
     names = {image.image_id: name for name, image in made.images.items()}
     with pycolmap.Database.open(path) as database:
@@ -101,14 +101,14 @@ def _write_database(working: Path, made: Map, path: Path) -> None:
 
 @pytest.fixture
 def own_matcher(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """What `pip install ./own_matcher` would put beside the module: the entry points of its project file."""
+    """What `pip install ./own_matcher` adds next to the module: the entry points of its project file."""
     source = ROOT / "examples" / "own_matcher"
     project = tomllib.loads((source / "pyproject.toml").read_text())["project"]
-    told = tmp_path / f"own_matcher-{project['version']}.dist-info"
-    told.mkdir()
-    (told / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
+    metadata = tmp_path / f"own_matcher-{project['version']}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
     (offered,) = project["entry-points"]["slimsfm.matchers"].items()
-    (told / "entry_points.txt").write_text(f"[slimsfm.matchers]\n{' = '.join(offered)}\n")
+    (metadata / "entry_points.txt").write_text(f"[slimsfm.matchers]\n{' = '.join(offered)}\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), str(source), *sys.path])
     plugins.cache_clear()
     yield

@@ -1,4 +1,4 @@
-"""What the start page and the how-tos tell to type is typed, page by page, in a folder as they want it."""
+"""The commands of the start page and the how-to guides run, page by page, in a folder with their inputs."""
 
 import re
 import shlex
@@ -14,24 +14,24 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = ["index.md", *(f"how-to/{path.name}" for path in sorted((DOCS / "how-to").glob("*.md")))]
 
 NOT_TYPED = (
-    "pip install ",  # the tests run with what is installed
-    "ffmpeg ",  # the Python lines beside it do the same
-    "slimsfm demo",  # its own test runs it
-    "slimsfm view ",  # goes on until it is stopped
+    "pip install ",  # the tests run with the installed packages
+    "ffmpeg ",  # the Python lines next to it do the same
+    "slimsfm demo",  # it has its own test
+    "slimsfm view ",  # runs until it is stopped
 )
-"""Beginnings of lines that are left out; every other one is run."""
+"""Lines that start like this are skipped. Every other line is run."""
 
 NOT_INSTALLED = ("hloc",)
-"""Packages that nobody can be asked to have; Python lines that import one are compiled, not run."""
+"""Packages that the tests cannot require. Python lines that import one are compiled, not run."""
 
 GIVEN = {"how-to/own-matcher.md": ("map",)}
-"""What lies in the folder of a page besides what all have."""
+"""Further inputs of a page."""
 
 _BLOCK = re.compile(r"^```(?P<language>\w*)\n(?P<lines>.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def examples(page: str) -> Iterator[tuple[str, str]]:
-    """The blocks of a page that can be run, in order: language and lines."""
+    """The blocks of a page that can be run, in order, as language and lines."""
     for match in _BLOCK.finditer((DOCS / page).read_text(encoding="utf-8")):
         language = match["language"]
         if not language and match["lines"].startswith("slimsfm "):
@@ -44,7 +44,7 @@ def type_line(line: str) -> None:
     if line.startswith(NOT_TYPED) or line.startswith("#"):
         return
     program, *arguments = shlex.split(line, comments=True)
-    assert program == "slimsfm", f"{line}: what the tests do not run stands in NOT_TYPED"
+    assert program == "slimsfm", f"{line}: lines that the tests do not run belong in NOT_TYPED"
     done = slimsfm(*arguments)
     assert done.code == 0, f"{line}\n{done.err}"
 
@@ -55,7 +55,7 @@ def imports(lines: str, package: str) -> bool:
 
 @pytest.fixture
 def page(filmed: Path, projects: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request) -> str:
-    """A page, whose folder is the current one."""
+    """A page with its inputs in the current folder."""
     place = tmp_path / "place"
     shutil.copytree(filmed, place)
     for name in ("project", "outputs", "queries.txt", "box3d_corners.txt", *GIVEN.get(request.param, ())):
@@ -67,7 +67,7 @@ def page(filmed: Path, projects: Path, tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.usefixtures("own_matcher")
 @pytest.mark.parametrize("page", PAGES, indirect=True)
-def test_what_a_page_tells_to_type_works(page):
+def test_the_commands_of_a_page_work(page):
     space = {"__name__": "__main__"}
     for number, (language, lines) in enumerate(examples(page)):
         if language == "sh":
@@ -79,7 +79,7 @@ def test_what_a_page_tells_to_type_works(page):
                 exec(code, space)
 
 
-def test_every_page_shows_something_that_is_run():
+def test_every_page_has_something_that_is_run():
     for page in PAGES:
         lines = [line for language, text in examples(page) if language == "sh" for line in text.splitlines()]
         is_typed = any(not line.startswith(NOT_TYPED) for line in lines)

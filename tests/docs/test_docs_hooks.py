@@ -3,6 +3,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from slimsfm.cli import COMMANDS
+from slimsfm.cli.options import options_of
+
 
 def test_a_formula_becomes_mathml_and_the_rest_stays(hook):
     html = '<p>An <span class="arithmatex">\\(e_{uv} &lt; 0.05\\)</span> edge, <code>$x$</code></p>'
@@ -13,24 +16,28 @@ def test_a_formula_becomes_mathml_and_the_rest_stays(hook):
     assert made.endswith("</math> edge, <code>$x$</code></p>")
 
 
-def test_a_displayed_formula_has_a_line_of_its_own(hook):
+def test_a_displayed_formula_has_its_own_line(hook):
     made = hook("mathematics").on_page_content('<div class="arithmatex">\\[\n\\frac{1}{8 d}\n\\]</div>')
     assert 'display="block"' in made
     assert "<mfrac>" in made
 
 
-@pytest.mark.parametrize("command", [("localize",), ("benchmark", "images"), ("export", "hloc")])
-def test_help_is_plain_text_in_lines_of_80(hook, monkeypatch, command):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    said = hook("commands").help_of(*command)
-    assert "\x1b" not in said
-    assert said.startswith(f"usage: slimsfm {command[0]}")
-    assert max(len(line) for line in said.splitlines()) <= 80
+@pytest.mark.parametrize("command", ["localize", "benchmark images", "export hloc"])
+def test_every_option_of_a_command_is_a_row_of_its_tables(hook, command):
+    section = hook("commands").section_of(command)
+    assert f"```sh\nslimsfm {command} " in section
+    rows = [line.strip() for line in section.splitlines() if line.strip().startswith("| `")]
+    options = options_of(COMMANDS[command].load())
+    assert len(rows) == len(options)
+    for row, option in zip(rows, options, strict=True):
+        assert row.startswith(f"| `{', '.join(option.flags) or option.metavar}")
+        assert row.count(" | ") == 2
+        assert option.help
 
 
-def test_help_of_what_is_no_command_is_an_error(hook):
-    with pytest.raises(RuntimeError, match="slimsfm fly --help fails: slimsfm: 'fly' is no command"):
-        hook("commands").help_of("fly")
+def test_a_section_of_an_unknown_command_is_an_error(hook):
+    with pytest.raises(KeyError, match="fly"):
+        hook("commands").section_of("fly")
 
 
 @pytest.mark.parametrize(
@@ -46,7 +53,7 @@ def test_help_of_what_is_no_command_is_an_error(hook):
         ("index.md", "#in-python", "#in-python"),
     ],
 )
-def test_links_lead_from_page_to_page_as_from_file_to_file(hook, page, link, on_site):
+def test_links_between_files_become_links_between_pages(hook, page, link, on_site):
     asking = SimpleNamespace(file=SimpleNamespace(src_uri=page))
     made = hook("repository").on_page_markdown(f"[one]({link}), [`two`]({link})", page=asking)
     assert made == f"[one]({on_site}), [`two`]({on_site})"

@@ -18,7 +18,7 @@ def cells() -> list[dict]:
     return notebook["cells"]
 
 
-def test_it_is_small_and_its_outputs_are_of_no_certain_machine(cells):
+def test_it_is_small_and_independent_of_the_machine(cells):
     assert NOTEBOOK.stat().st_size < MOST_BYTES
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert all(cell["execution_count"] is None for cell in code)
@@ -28,11 +28,11 @@ def test_it_is_small_and_its_outputs_are_of_no_certain_machine(cells):
 
 
 def without_numbers(text: str) -> str:
-    """A time, and at times a last digit, is of a machine."""
+    """Times, and sometimes last digits, depend on the machine."""
     return re.sub(r"[\d.]+", "#", text)
 
 
-def test_its_cells_run_one_after_the_other(cells, tmp_path):
+def test_its_cells_run_in_order(cells, tmp_path):
     lines = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     done = subprocess.run(
         [sys.executable, "-c", lines],

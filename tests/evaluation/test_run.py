@@ -222,7 +222,7 @@ def test_a_run_with_other_options_is_kept_unless_overwrite_is_on(whole, dataset,
     before = contents(folder)
     options = replace(OPTIONS, strategies=("direct",), variants=("full",))
     bench = BenchmarkSetup(folder=folder, options=options)
-    with pytest.raises(OutputError, match=r"run: holds a run with other options; choose .* set overwrite"):
+    with pytest.raises(OutputError, match=r"run: holds a run with other options; choose .* `overwrite=True`"):
         run_benchmark(dataset, bench)
     assert contents(folder) == before
     run = run_benchmark(dataset, bench, overwrite=True)

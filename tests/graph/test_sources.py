@@ -135,7 +135,7 @@ def test_auto_is_matches_or_tracks_where_there_are_none(exact):
     bare = replace(exact, matches={})
     assert resolve_edges(bare, OPTIONS) == "tracks"
     assert [resolve_edges(exact, GraphOptions(edges=edges)) for edges in EDGE_SOURCES] == list(EDGE_SOURCES)
-    with pytest.raises(InputError, match="no matches; set edges to tracks or localize"):
+    with pytest.raises(InputError, match="no matches; use `edges='tracks'` or `edges='localize'`"):
         edge_source(bare, GraphOptions(edges="matches"))
 
 

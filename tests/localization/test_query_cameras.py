@@ -73,7 +73,7 @@ def test_without_any_of_them_the_error_asks_for_a_camera(exact, two_cameras, tmp
         (exact, photo(tmp_path / "upright.png", (480, 640))),
         (two_cameras, photo(tmp_path / "plain.png")),
     ):
-        with pytest.raises(ImageError, match=f"{path.name}.*give the camera.*, or estimate the focal length"):
+        with pytest.raises(ImageError, match=f"{path.name}.*camera=FILE.*focal='unknown'"):
             query_camera(map_, path, None)
 
 

@@ -40,7 +40,7 @@ def test_per_image_gives_each_image_its_camera(folder):
 
 
 def test_images_of_two_sizes_cannot_share_a_camera(folder):
-    with pytest.raises(InputError, match=r"a\.jpg has 60x40 pixels, d\.jpg 40x60.*be 'auto'"):
+    with pytest.raises(InputError, match=r"a\.jpg has 60x40 pixels, d\.jpg 40x60.*camera='auto'"):
         guess_cameras(folder, ["a.jpg", "d.jpg"], "shared")
 
 

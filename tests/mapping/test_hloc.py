@@ -236,7 +236,7 @@ def test_hlocs_localization_finds_the_true_poses(exact, tmp_path, stored):
 def test_a_map_for_direct_matching_is_refused(exact, tmp_path):
     rows = np.arange(5)
     points = PointDescriptors(points=rows, descriptors=np.eye(5, 32, dtype=np.float32))
-    with pytest.raises(MapError, match=r"direct matching alone.*reduced for matching images"):
+    with pytest.raises(MapError, match=r"direct matching alone.*reduce the full map for images instead"):
         write_hloc(direct_map(exact, points), tmp_path / "out")
     assert contents(tmp_path) == {}
 

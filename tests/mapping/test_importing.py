@@ -137,7 +137,7 @@ def test_the_database_is_found_where_colmap_puts_it_and_not_changed(editable):
 def test_without_a_database_the_error_names_other_sources(editable):
     (editable.folder / "database.db").unlink()
     with pytest.raises(
-        InputError, match=r"no database\.db next to the model.*database.*features.*folder of images"
+        InputError, match=r"no database\.db next to the model.*database=FILE.*features=FILE.*images=DIR"
     ):
         import_colmap(editable.model)
     with pytest.raises(InputError, match="no such database"):

@@ -227,7 +227,7 @@ def test_neighbours_are_near_and_look_elsewhere():
 
 def test_pairs_of_similar_images_cannot_be_asked_for():
     names = [f"{number:02d}" for number in range(40)]
-    with pytest.raises(InputError, match="set pairs to exhaustive"):
+    with pytest.raises(InputError, match="`pairs='exhaustive'`"):
         choose_image_pairs(names, "similar", None)
     assert choose_image_pairs(names[:30], "auto", None) == exhaustive_pairs(names[:30])
     assert len(choose_image_pairs(names, "auto", None)) < len(exhaustive_pairs(names))

@@ -1,19 +1,10 @@
 """`slimsfm build`."""
 
-from collections.abc import Sequence
 from typing import Annotated
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import (
-    Flat,
-    ImagesPath,
-    OutputPath,
-    Stopwatch,
-    check_output,
-    console,
-    finish_map,
-    parse,
-)
+from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -23,18 +14,20 @@ def build_photos(
     images: ImagesPath,
     /,
     output: OutputPath,
-    build: Annotated[BuildOptions, Flat] = BuildOptions(),
-    networks: Annotated[Networks, Flat] = Networks(),
+    build: Annotated[BuildOptions, Advanced(("masks", "max_image_size", "max_features", "seed"))] = (
+        BuildOptions()
+    ),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     overwrite: bool = False,
 ) -> None:
     """Build a map from a folder of photos.
 
     Args:
-        images: Folder of photos, with those in its subfolders.
-        output: Where the map is written.
-        build: How to build.
+        images: Folder of photos; subfolders are included.
+        output: Folder of the map.
+        build: How to build the map.
         networks: Where learned methods run.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing map.
     """
     watch = Stopwatch()
     networks.apply()
@@ -46,8 +39,3 @@ def build_photos(
         console.print(f"{len(made.unregistered)} photos could not be registered: {names}", style="yellow")
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} ({made.info.unit} unit)")
     finish_map(made, output, watch)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(build_photos, arguments)

@@ -1,12 +1,10 @@
 """`slimsfm demo`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from slimsfm.cli.output import Stopwatch, console, finish, parse
+from slimsfm.cli.options import Flags
+from slimsfm.cli.output import Stopwatch, console, finish
 from slimsfm.cli.results import print_summary
 from slimsfm.datasets.synthetic import SynthesisOptions, Synthetic, synthesize
 from slimsfm.errors import OutputError
@@ -20,19 +18,19 @@ _OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=3
 
 
 def demo(
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("slimsfm-demo"), overwrite: bool = False
+    output: Annotated[Path, Flags(("-o", "--output"))] = Path("slimsfm-demo"), overwrite: bool = False
 ) -> None:
-    """Do the main job on two objects that it renders itself: map, reduce, localize, measure, report.
+    """Build, reduce, localize, measure and report on two objects that the demo renders itself.
 
     Args:
-        output: Folder for the objects, the run with its maps and results.json, and report.html.
-        overwrite: Replace the demo that is there.
+        output: Folder of the objects, the run with its maps and results.json, and report.html.
+        overwrite: Replace an existing demo.
     """
     from slimsfm.report import write_report  # imports matplotlib
 
     watch = Stopwatch()
     if output.exists() and any(output.iterdir() if output.is_dir() else [output]) and not overwrite:
-        raise OutputError(f"{output}: exists already; choose another output or pass --overwrite")
+        raise OutputError(f"{output}: exists already; choose another output or pass `overwrite=True`")
     folder, report = output / "objects", output / "report.html"
     with processes(num_cores()) as executor:
         synthesize(folder, _OBJECTS, overwrite=overwrite, progress=shown, executor=executor)
@@ -44,8 +42,3 @@ def demo(
     print_summary(write_results(run))
     write_report(report, run, overwrite=True)
     finish(f"{setup.folder / 'results.json'} and {report}", watch, "build", "PHOTOS", "-o", "MAP")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(demo, arguments)

@@ -1,4 +1,4 @@
-"""Where long work is done, as options of a command."""
+"""Options of commands: where the work runs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,20 +10,20 @@ from slimsfm.execution import OpenExecutor, dask_cluster, num_cores, processes
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """Where the work is done."""
+    """Processes or machines that share the work."""
 
     workers: int | None = None
-    """Processes to use; one a core if not given, and 1 works in this one."""
+    """Number of worker processes, by default the number of cores. 1 starts no other process."""
 
     scheduler: str | None = None
-    """A Dask cluster: the address of its scheduler (tcp://...), or "local" for one of this machine."""
+    """Address of the scheduler of a Dask cluster (tcp://...), or `local` to start one on this machine."""
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
             raise ValueError(f"workers must be at least 1, got {self.workers}")
 
     def open_executor(self) -> OpenExecutor | None:
-        """How to open the means of execution; None: this process."""
+        """Return a function that opens the executor; None if the work runs in this process."""
         workers = self.workers or num_cores()
         if self.scheduler:
             address = None if self.scheduler == "local" else self.scheduler
@@ -33,8 +33,8 @@ class Execution:
 
 @contextmanager
 def resumable() -> Iterator[None]:
-    """Say of an interruption that what was done is not lost."""
+    """Add to an interruption that finished work is saved."""
     try:
         yield
     except KeyboardInterrupt as interruption:
-        raise KeyboardInterrupt("the same command goes on where it stopped") from interruption
+        raise KeyboardInterrupt("run the same command again to resume") from interruption

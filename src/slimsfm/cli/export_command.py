@@ -1,50 +1,34 @@
 """`slimsfm export`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import (
-    Flat,
-    MapPath,
-    OutputPath,
-    Stopwatch,
-    check_output,
-    console,
-    finish,
-    parse,
-    size,
-)
-from slimsfm.errors import InputError, OutputError
-from slimsfm.features.registry import EXPORTABLE, export_method
+from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural, size
+from slimsfm.errors import OutputError
+from slimsfm.features.registry import export_method
 from slimsfm.files import check_writable
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.io import read_map
 
-_MethodName = Annotated[
-    tyro.conf.Positional[str], tyro.conf.arg(metavar="METHOD", help=f"One of {', '.join(EXPORTABLE)}.")
-]
-
 
 def export_onnx(
-    method: _MethodName,
+    method: Annotated[str, Argument("METHOD")],
     /,
     output: OutputPath,
-    networks: Annotated[Networks, Flat] = Networks(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     overwrite: bool = False,
 ) -> None:
-    """Export the network of a method as an ONNX file, by which it runs on the CPU.
+    """Export the network of a method as an ONNX file.
 
-    It does so wherever the file lies in the folder of weights, named METHOD.onnx.
+    Put the file into the folder of weights as METHOD.onnx, and the method runs from it on the CPU.
 
     Args:
-        method: Which.
-        output: Where the file is written.
-        networks: Where weights are.
-        overwrite: Replace what is there.
+        method: One of `slimsfm methods`; an unknown name lists those that can be exported.
+        output: The file to write.
+        networks: Where the weights are.
+        overwrite: Replace an existing file.
     """
     watch = Stopwatch()
     networks.apply()
@@ -53,22 +37,24 @@ def export_onnx(
     check_writable(output, overwrite=overwrite)
     export_method(method, output, overwrite=overwrite)
     finish(f"{output}: {method}, {size(output.stat().st_size)}", watch)
-    console.print(f"runs {method} on the CPU as {method}.onnx in the folder of weights", style="dim")
+    console.print(
+        f"put it into the folder of weights as {method}.onnx to run {method} from it on the CPU", style="dim"
+    )
 
 
 def export_hloc(
     map: MapPath, /, output: OutputPath, queries: Path | None = None, overwrite: bool = False
 ) -> None:
-    """Export a map whose images have features as hloc's `match_features` and `localize_sfm` read it.
+    """Export a map for hloc's `match_features` and `localize_sfm`.
 
-    The folder gets sfm/, features.h5, references.txt, matches.h5 where the map has matches, and
-    pairs-queries.txt where queries are given: each query with every image of the map.
+    The output folder contains sfm/, features.h5, references.txt, matches.h5 if the map has matches, and
+    pairs-queries.txt if queries are given: every query with every image of the map.
 
     Args:
-        map: A map.
-        output: Where the folder is written.
-        queries: A folder of images, or a text file with a name a line, such as hloc's list of queries.
-        overwrite: Replace what is there.
+        map: A map whose images have features.
+        output: The folder to write.
+        queries: A folder of images, or a text file with one name per line, such as hloc's list of queries.
+        overwrite: Replace an existing output.
     """
     watch = Stopwatch()
     for source in (map, queries) if queries else (map,):
@@ -76,25 +62,12 @@ def export_hloc(
     names = read_query_names(queries) if queries else []
     exported = read_map(map)
     write_hloc(exported, output, names, overwrite=overwrite)
-    pairs = f", {len(names) * len(exported.images)} pairs of {len(names)} queries" if queries else ""
-    finish(f"{output}: {len(exported.images)} images, {len(exported.point3D_ids)} points{pairs}", watch)
+    images, points = plural(len(exported.images), "image"), plural(len(exported.point3D_ids), "point")
+    number = plural(len(names) * len(exported.images), "pair")
+    pairs = f", {number} of {plural(len(names), 'query', 'queries')}" if queries else ""
+    finish(f"{output}: {images}, {points}{pairs}", watch)
     console.print(
-        f"hloc: match_features takes the pairs and features_ref={output / 'features.h5'}, "
-        f"then localize_sfm takes {output / 'sfm'}",
+        f"in hloc, pass the pairs and features_ref={output / 'features.h5'} to match_features, "
+        f"then {output / 'sfm'} to localize_sfm",
         style="dim",
     )
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    kind, *rest = arguments or ["--help"]
-    if kind in ("-h", "--help"):
-        console.print("usage: slimsfm export onnx METHOD -o FILE   (more: slimsfm export onnx --help)")
-        console.print("       slimsfm export hloc MAP -o OUT       (more: slimsfm export hloc --help)")
-        return
-    if kind not in _KINDS:
-        raise InputError(f"{kind!r} is no kind of export; there is {', '.join(_KINDS)}")
-    parse(_KINDS[kind], rest, kind)
-
-
-_KINDS = {"onnx": export_onnx, "hloc": export_hloc}

@@ -1,20 +1,19 @@
 """`slimsfm figures`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from rich.markup import escape
 
-from slimsfm.cli.output import OutputPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Argument, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.errors import InputError
 from slimsfm.evaluation.result_files import read_run
 from slimsfm.progress import shown
 
 
 def figures(
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")],
+    run: Annotated[Path, Argument("RUN")],
     /,
     output: OutputPath,
     format: Literal["png", "svg", "pdf"] = "png",
@@ -43,8 +42,3 @@ def figures(
     for path, explanation in written.files.items():
         console.print(f"{escape(str(path))}  [dim]{explanation}[/dim]")
     finish(f"{output}: {len(written.files)} figures", watch, "report", run, "-o", "report.html")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(figures, arguments)

@@ -1,13 +1,13 @@
 """`slimsfm frontier`."""
 
 import json as json_format
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from slimsfm.cli.choices import frontier_to_json, kept_graph, print_frontier, promise, read_reducible
 from slimsfm.cli.execution import Execution
-from slimsfm.cli.output import Flat, MapPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Advanced, MapPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.files import replacing
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
@@ -19,10 +19,10 @@ from slimsfm.report.tradeoffs import curves_figure
 def frontier_of(
     map: MapPath,
     /,
-    comparison: Annotated[FrontierOptions, Flat] = FrontierOptions(),
+    comparison: FrontierOptions = FrontierOptions(),
     json: Path | None = None,
     curves: Path | None = None,
-    execution: Annotated[Execution, Flat] = Execution(),
+    execution: Annotated[Execution, Advanced()] = Execution(),
     overwrite: bool = False,
 ) -> None:
     """List what a map can be reduced to and what each way is predicted to lose; recommend one per use.
@@ -55,8 +55,3 @@ def frontier_of(
     if curves:
         save_figure(curves_figure(found, recommended, size), curves, overwrite=overwrite)
     finish(f"{len(found.candidates)} ways to reduce {map}", watch, "reduce", map, "-o", f"{map}-small")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(frontier_of, arguments)

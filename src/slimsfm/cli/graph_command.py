@@ -1,16 +1,15 @@
 """`slimsfm graph`."""
 
 import json as json_format
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from slimsfm.cli.execution import Execution, resumable
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import Flat, MapPath, Stopwatch, console, finish, parse
+from slimsfm.cli.options import Advanced, Flags, MapPath
+from slimsfm.cli.output import Stopwatch, console, finish
 from slimsfm.files import check_writable, replacing
 from slimsfm.graph import GraphOptions, GraphRun
 from slimsfm.graph.compute import estimate_recall, load_or_compute_graph
@@ -23,10 +22,10 @@ from slimsfm.progress import shown
 def graph(
     map: MapPath,
     /,
-    edges: Annotated[GraphOptions, Flat] = GraphOptions(),
-    execution: Annotated[Execution, Flat] = Execution(),
-    networks: Annotated[Networks, Flat] = Networks(),
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None,
+    edges: GraphOptions = GraphOptions(),
+    execution: Annotated[Execution, Advanced()] = Execution(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
+    output: Annotated[Path | None, Flags(("-o", "--output"))] = None,
     json: Path | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -85,8 +84,3 @@ def _figures(run: GraphRun, threshold: float) -> dict:
 
 def _range(degrees: np.ndarray) -> dict[str, int | float]:
     return {"min": int(degrees.min()), "median": float(np.median(degrees)), "max": int(degrees.max())}
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(graph, arguments)

@@ -1,18 +1,7 @@
 """`slimsfm import`."""
 
-from collections.abc import Sequence
-from typing import Annotated
-
-from slimsfm.cli.output import (
-    Flat,
-    ModelPath,
-    OutputPath,
-    Stopwatch,
-    check_output,
-    console,
-    finish_map,
-    parse,
-)
+from slimsfm.cli.options import ModelPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -22,16 +11,16 @@ def import_(
     model: ModelPath,
     /,
     output: OutputPath,
-    source: Annotated[ImportOptions, Flat] = ImportOptions(),
+    source: ImportOptions = ImportOptions(),
     overwrite: bool = False,
 ) -> None:
-    """Make a map of an existing COLMAP model and the descriptors of its keypoints.
+    """Make a map from a COLMAP model and the descriptors of its keypoints.
 
     Args:
         model: Folder with cameras, images and points3D, as .bin or .txt.
-        output: Where the map is written.
+        output: Folder of the map.
         source: Where the descriptors come from.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing map.
     """
     watch = Stopwatch()
     check_output(output, model, overwrite=overwrite)
@@ -39,8 +28,3 @@ def import_(
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")
     finish_map(made, output, watch)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(import_, arguments)

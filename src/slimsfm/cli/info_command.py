@@ -1,58 +1,79 @@
 """`slimsfm info`."""
 
-import json
-from collections.abc import Sequence
-from pathlib import Path
+import json as json_format
 
-from slimsfm.cli.output import MapPath, console, counts, parse, size
+from slimsfm.cli.options import MapPath
+from slimsfm.cli.output import console, counts, plural, size
 from slimsfm.mapping.io import bytes_by_part, read_map
+from slimsfm.mapping.map import Map
 
 
 def info(map: MapPath, /, json: bool = False, images: bool = False) -> None:
-    """Tell what is in a map.
+    """Show what a map contains.
 
     Args:
         map: A map.
-        json: Print JSON, for programs.
+        json: Print JSON for programs, which includes the corners of the box.
         images: List the names of the reference images.
     """
-    facts = _facts(map)
+    map_, sizes = read_map(map), bytes_by_part(map)
     if json:
-        print(_to_json(facts))
+        print(json_format.dumps(_facts(map_, sizes), indent=2))
         return
-    for name, value in facts.items():
-        if name == "images":
-            console.print(f"{name:<24}{len(value)}" + (f": {', '.join(value)}" if images else ""))
-        elif name == "bytes":
-            console.print(f"{name:<24}" + ", ".join(f"{part} {size(n)}" for part, n in value.items()))
-        else:
-            console.print(f"{name:<24}{value}")
+    for name, text in _lines(map_, sizes).items():
+        console.print(f"{name:<14}{text}", markup=False)
+    if images:
+        console.print(f"{'image names':<14}{', '.join(map_.images)}", markup=False)
 
 
-def _facts(path: Path) -> dict:
-    map_ = read_map(path)
-    extractor = {"name": map_.info.extractor, "options": map_.info.extractor_options}
-    box = map_.box
-    parts = counts(map_)
+def _facts(map: Map, sizes: dict[str, int]) -> dict:
+    box, parts = map.box, counts(map)
     return {
-        "images": list(map_.images),
+        "kind": _kind(map),
+        "images": list(map.images),
         "points": parts["points"],
         "observations": parts["observations"],
-        "mean_track_length": round(map_.model.compute_mean_track_length(), 3),
-        "mean_reprojection_error_px": round(map_.model.compute_mean_reprojection_error(), 4),
-        "verified_pairs": len(map_.matches),
-        "box": {"diagonal": box.diagonal, "source": map_.info.box_source, "corners": box.corners.tolist()},
-        "unit": map_.info.unit,
-        "extractor": extractor,
-        "origin": map_.info.origin,
-        "bytes": bytes_by_part(path),
+        "mean_track_length": round(map.model.compute_mean_track_length(), 3),
+        "mean_reprojection_error_px": round(map.model.compute_mean_reprojection_error(), 4),
+        "verified_pairs": len(map.matches),
+        "box": {"diagonal": box.diagonal, "source": map.info.box_source, "corners": box.corners.tolist()},
+        "unit": map.info.unit,
+        "extractor": {"name": map.info.extractor, "options": map.info.extractor_options},
+        "origin": map.info.origin,
+        "bytes": sizes,
     }
 
 
-def _to_json(facts: dict) -> str:
-    return json.dumps(facts, indent=2)
+def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
+    """The facts that a person needs. A map of points only has no observations."""
+    model, parts, info = map.model, counts(map), map.info
+    points = plural(parts["points"], "point")
+    if parts["observations"]:
+        points += (
+            f", {plural(parts['observations'], 'observation')}, "
+            f"mean track length {model.compute_mean_track_length():.1f}, "
+            f"mean reprojection error {model.compute_mean_reprojection_error():.2f} px"
+        )
+    matches = f", {plural(len(map.matches), 'verified pair')}" if map.matches else ""
+    options = ", ".join(f"{key} {value}" for key, value in info.extractor_options.items())
+    unit = "map units (unknown scale)" if info.unit == "unknown" else info.unit
+    return {
+        "kind": _kind(map),
+        "origin": info.origin,
+        "images": f"{len(map.images)}{matches}",
+        "points": points,
+        "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
+        "extractor": info.extractor + (f" ({options})" if options else ""),
+        "size": ", ".join(f"{part} {size(number)}" for part, number in sizes.items()),
+    }
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(info, arguments)
+def _kind(map: Map) -> str:
+    """What queries are matched with."""
+    if map.is_for_direct_matching:
+        return "points for direct matching, reduced from a full map"
+    if map.photos:
+        return "photos to match without a detector"
+    if map.point_descriptors:
+        return "images with local features, and points for direct matching"
+    return "images with local features"

@@ -1,6 +1,6 @@
 """`slimsfm localize`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,17 +9,8 @@ from typing import Annotated
 import pycolmap
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import (
-    Flat,
-    ImagesPath,
-    MapPath,
-    OutputPath,
-    Stopwatch,
-    check_output,
-    console,
-    finish,
-    parse,
-)
+from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
@@ -38,7 +29,7 @@ from slimsfm.pose import Gravity
 from slimsfm.progress import shown
 
 Found = dict[str, Localization]
-"""What became of each object in one image."""
+"""The outcome of each object in one image."""
 
 
 def localize(
@@ -47,27 +38,28 @@ def localize(
     /,
     output: OutputPath,
     also: tuple[Path, ...] = (),
-    localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
-    networks: Annotated[Networks, Flat] = Networks(),
+    localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     camera: Path | None = None,
     gravity: Path | None = None,
     workers: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Find where images were taken.
+    """Estimate the camera poses of images.
 
     Args:
         map: A map.
         images: A folder of images, or one image.
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
-        also: Maps of further objects to seek in the same images; then poses go to .json or .csv.
+        also: Maps of further objects to find in the same images. Poses are then written as .json or .csv.
         localization: How to localize.
         networks: Where learned methods run.
-        camera: Intrinsics of the images, in COLMAP's cameras.txt format; else the map's or EXIF's.
-        gravity: Where down is, as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame of
-            the map and those of the images' cameras.
-        workers: Images to work on at a time; one a core if not given.
-        overwrite: Replace what is there.
+        camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map or from
+            EXIF are used.
+        gravity: Direction of gravity as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame
+            of the map and in the camera frames of the images.
+        workers: Number of images to localize at a time, by default the number of cores.
+        overwrite: Replace an existing output.
     """
     watch = Stopwatch()
     networks.apply()
@@ -97,7 +89,7 @@ def localize(
         write_poses(output, next(iter(by_object.values())), overwrite=overwrite)
     _print(results, several=bool(also))
     found = sum(any(one.pose for one in of_image.values()) for of_image in results.values())
-    finish(f"{output}: {found} of {len(results)} images localized", watch, "info", map)
+    finish(f"{output}: {found} of {plural(len(results), 'image')} localized", watch)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +100,7 @@ class _Query:
 
 
 def _named(*paths: Path) -> dict[str, Path]:
-    """Maps by the last part of their paths, or by the whole where these are equal."""
+    """Map paths by their last part, or by the whole path where these parts are equal."""
     last = [path.resolve().name for path in paths]
     names = last if len(set(last)) == len(last) else [str(path) for path in paths]
     if len(set(names)) < len(names):
@@ -144,17 +136,11 @@ def _print(results: Mapping[str, Found], *, several: bool) -> None:
     for one in (one for found in results.values() for one in found.values()):
         for stage in stages:
             times[stage] += 1e3 * getattr(one.seconds, stage) / len(results)
-    console.print("a query: " + ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in times.items()))
+    console.print("per query: " + ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in times.items()))
 
 
 def _outcome(one: Localization) -> str:
     if one.pose is None:
         return "not localized"
-    return (
-        f"{one.pose.num_inliers} inliers of {one.num_matches} matches, confidence {one.pose.confidence:.2f}"
-    )
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(localize, arguments)
+    inliers = f"{one.pose.num_inliers} inliers of {one.num_matches} matches"
+    return f"{inliers}, confidence {one.pose.confidence:.2f}"

@@ -1,6 +1,5 @@
 """`slimsfm methods`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Annotated
@@ -8,7 +7,8 @@ from typing import Annotated
 from rich.table import Table
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import Flat, console, parse
+from slimsfm.cli.options import Advanced
+from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.features.registry import plugins
 from slimsfm.weights import WEIGHTS, find_weights
@@ -19,52 +19,52 @@ class _Method:
     kind: str
     name: str
     by: str
-    licence: str
+    license: str
     weights: tuple[str, ...] = ()
 
 
-_LEARNED = ("torch", "kornia", "transformers")  # what methods with weights need
+_LEARNED = ("torch", "kornia", "transformers")  # required by methods with weights
 _METHODS = (
-    _Method(kind="extractor", name="sift", by="OpenCV", licence="Apache-2.0"),
+    _Method(kind="extractor", name="sift", by="OpenCV", license="Apache-2.0"),
     _Method(
         kind="extractor",
         name="aliked",
         by="kornia",
-        licence="Apache-2.0",
+        license="Apache-2.0",
         weights=("aliked-n16", "aliked-t16"),
     ),
-    _Method(kind="extractor", name="disk", by="kornia", licence="Apache-2.0", weights=("disk",)),
+    _Method(kind="extractor", name="disk", by="kornia", license="Apache-2.0", weights=("disk",)),
     _Method(
         kind="extractor",
         name="superpoint",
         by="transformers",
-        licence="Apache-2.0",
+        license="Apache-2.0",
         weights=("superpoint",),
     ),
-    _Method(kind="matcher", name="nearest", by="slimsfm", licence="BSD-3-Clause"),
+    _Method(kind="matcher", name="nearest", by="slimsfm", license="BSD-3-Clause"),
     _Method(
         kind="matcher",
         name="lightglue",
         by="kornia",
-        licence="Apache-2.0",
+        license="Apache-2.0",
         weights=tuple(name for name in WEIGHTS if name.startswith("lightglue-")),
     ),
     _Method(
         kind="matcher",
         name="superglue",
         by="transformers",
-        licence="Apache-2.0",
+        license="Apache-2.0",
         weights=("superglue",),
     ),
     _Method(
         kind="detector-free",
         name="loftr",
         by="kornia",
-        licence="Apache-2.0",
+        license="Apache-2.0",
         weights=("loftr", "loftr-onepose++"),
     ),
     *(
-        _Method(kind="strategy", name=name, by="slimsfm", licence="BSD-3-Clause")
+        _Method(kind="strategy", name=name, by="slimsfm", license="BSD-3-Clause")
         for name in ("exhaustive", "retrieval", "progressive", "direct")
     ),
     *(
@@ -72,7 +72,7 @@ _METHODS = (
             kind="strategy",
             name=name,
             by="slimsfm",
-            licence="BSD-3-Clause",
+            license="BSD-3-Clause",
             weights=(name,),
         )
         for name in ("onepose", "onepose++")
@@ -80,18 +80,18 @@ _METHODS = (
 )
 
 
-def methods(networks: Annotated[Networks, Flat] = Networks()) -> None:
-    """List extractors, matchers and strategies: who wrote them, their licences, whether weights are here.
+def methods(networks: Annotated[Networks, Advanced()] = Networks()) -> None:
+    """List extractors, matchers and strategies with their origins, licenses and weights.
 
     Args:
-        networks: Where weights are.
+        networks: Where the weights are.
     """
     networks.apply()
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for column in ("", "method", "code", "licence", "weights", "their licence", "found"):
+    for column in ("", "method", "code", "license", "weights", "their license", "found"):
         table.add_column(column)
     for method in _METHODS:
-        code = method.kind, method.name, method.by, method.licence
+        code = method.kind, method.name, method.by, method.license
         if not method.weights:
             table.add_row(*code, "none needed", "", _installed(method))
         for row, name in enumerate(method.weights):
@@ -103,8 +103,8 @@ def methods(networks: Annotated[Networks, Flat] = Networks()) -> None:
             table.add_row(kind, name, path, "its own", "", "", "plug-in")
     console.print(table)
     console.print(
-        "weights are sought in --weights or SLIMSFM_WEIGHTS, then in the libraries' caches, which fetch them "
-        "where there is a network",
+        "weights are searched for in --weights or $SLIMSFM_WEIGHTS, then in the caches of the libraries, "
+        "which download them if there is a network",
         style="dim",
     )
 
@@ -120,9 +120,4 @@ def _found(method: _Method, name: str) -> str:
     try:
         return "yes" if find_weights(name) else "not in the folder"
     except InputError:
-        return "no: another file of that name"
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(methods, arguments)
+        return "no: another file has this name"

@@ -1,4 +1,4 @@
-"""Where networks run and where their weights are, as options of a command."""
+"""Options of commands: where networks run and where their weights are."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +9,13 @@ from slimsfm.weights import Runtime, use_runtime
 
 @dataclass(frozen=True, kw_only=True)
 class Networks:
-    """Learned methods."""
+    """Weights and device of learned methods."""
 
     weights: Path | None = None
-    """Folder of weight files; else the one that SLIMSFM_WEIGHTS names, else the libraries' caches."""
+    """Folder of weight files; by default $SLIMSFM_WEIGHTS, then the caches of the libraries."""
 
     device: Literal["auto", "cpu", "cuda"] | None = None
-    """Where networks run; auto: on a GPU if there is one. Else as SLIMSFM_DEVICE says."""
+    """Where networks run; `auto` takes a GPU if there is one. The default is $SLIMSFM_DEVICE."""
 
     def apply(self) -> None:
         """Use these for all networks of the command, including those in its worker processes.

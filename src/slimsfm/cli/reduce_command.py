@@ -1,6 +1,5 @@
 """`slimsfm reduce`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -8,7 +7,8 @@ import tyro
 
 from slimsfm.cli.choices import kept_graph, print_change, print_dominating_set, promise, read_reducible
 from slimsfm.cli.execution import Execution
-from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.options import Advanced, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.cli.units import LimitArguments
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -28,10 +28,10 @@ class ReduceArguments:
     selector: str | None = None
     """Selector of the points: information, kcover or random. By default the first two are compared."""
 
-    limits: Annotated[LimitArguments, Flat] = LimitArguments()
+    limits: LimitArguments = LimitArguments()
     """Limits of the reduced map."""
 
-    image_choice: Annotated[ImageOptions, Flat] = ImageOptions()
+    image_choice: ImageOptions = ImageOptions()
     """How images are chosen."""
 
     seed: int = 0
@@ -56,8 +56,8 @@ def reduce(
     map: MapPath,
     /,
     output: OutputPath,
-    choosing: Annotated[ReduceArguments, Flat] = ReduceArguments(),
-    execution: Annotated[Execution, Flat] = Execution(),
+    choosing: ReduceArguments = ReduceArguments(),
+    execution: Annotated[Execution, Advanced()] = Execution(),
     overwrite: bool = False,
 ) -> None:
     """Make a map small, and say what that costs.
@@ -85,8 +85,3 @@ def reduce(
     for one in reduced.forecast.values():
         console.print(f"{one.choice.method} ({one.choice.detail}): {promise(map, full, one)}")
     finish(f"{output}: written", watch, "localize", output, "IMAGES", "-o", "poses.json")
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(reduce, arguments)

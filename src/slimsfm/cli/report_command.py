@@ -1,19 +1,17 @@
 """`slimsfm report`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from slimsfm.cli.output import OutputPath, Stopwatch, finish, parse
+from slimsfm.cli.options import Argument, OutputPath
+from slimsfm.cli.output import Stopwatch, finish
 from slimsfm.errors import InputError
 from slimsfm.evaluation.result_files import read_run
 from slimsfm.files import check_writable
 
 
 def report(
-    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")],
+    run: Annotated[Path, Argument("RUN")],
     /,
     output: OutputPath,
     overwrite: bool = False,
@@ -36,8 +34,3 @@ def report(
         raise InputError(f"{run}: no object could be measured; run slimsfm benchmark again")
     write_report(output, measured, overwrite=overwrite)
     finish(str(output), watch)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(report, arguments)

@@ -1,34 +1,25 @@
 """`slimsfm track`."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import cv2
-import numpy as np
-import pycolmap
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from slimsfm.arrays import Image
-from slimsfm.cli.output import Flat, MapPath, OutputPath, Stopwatch, check_output, console, finish, parse
+from slimsfm.cli.networks import Networks
+from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
+from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError
-from slimsfm.files import uninterrupted
-from slimsfm.geometry import Box
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.cameras import query_camera, read_camera, scaled_camera
+from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
 from slimsfm.mapping.io import read_map
-from slimsfm.mapping.map import Map
-from slimsfm.report.frames import TRUE_RGB, draw_box
-from slimsfm.tracking import Tracked, Tracker, TrackerOptions
-from slimsfm.tracking.video import FrameSource, VideoFrame, check_format, open_frames, write_video
+from slimsfm.report.tracked_video import track_video
+from slimsfm.tracking import Tracked, TrackerOptions
+from slimsfm.tracking.video import FrameSource, VideoFrame, check_format
 
-VideoPath = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="VIDEO")]
-
-_FAINTEST = 0.2  # opacity of the box of a pose that deserves no belief
+VideoPath = Annotated[str, Argument("VIDEO")]
 
 
 def track(
@@ -37,26 +28,30 @@ def track(
     /,
     output: OutputPath,
     video: Path | None = None,
-    tracker: Annotated[TrackerOptions, Flat] = TrackerOptions(),
-    localization: Annotated[LocalizationOptions, Flat] = LocalizationOptions(),
     camera: Path | None = None,
+    tracker: Annotated[TrackerOptions, Advanced()] = TrackerOptions(),
+    localization: Annotated[LocalizationOptions, Advanced()] = LocalizationOptions(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     overwrite: bool = False,
 ) -> None:
-    """Follow an object through a video.
+    """Track an object through a video and write the camera pose of every frame.
 
     Args:
         map: A map.
         source: A video file, a folder of images, or a camera by its index, such as 0, until Ctrl-C.
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
-        video: Write the video with the object's box drawn in, fainter where the pose is less sure.
+        video: Write the video with the object's box. The fainter the box, the less sure the pose.
+        camera: Intrinsics of the frames in COLMAP's cameras.txt format. Without it, those of the map or from
+            EXIF are used.
         tracker: How to track.
         localization: How to localize.
-        camera: Intrinsics of the frames, in COLMAP's cameras.txt format; else the map's or EXIF's.
-        overwrite: Replace what is there.
+        networks: Where learned methods run.
+        overwrite: Replace existing outputs.
     """
     watch = Stopwatch()
+    networks.apply()
     if localization.focal != "known":
-        raise InputError("tracking needs a known focal length; leave out --focal and give --camera FILE")
+        raise InputError("tracking needs a known focal length; use `focal='known'` and `camera=FILE`")
     for path in (output, video) if video else (output,):
         for made_of in (map, Path(source)):
             check_output(path, made_of, overwrite=overwrite)
@@ -64,45 +59,13 @@ def track(
     if video:
         check_format(video)
     given = read_camera(camera) if camera else None
-    map_, frames = read_map(map), open_frames(source)
-    follower = Tracker(Localizer(map_, localization), tracker)
-    drawing = write_video(video, frames.frames_per_second, overwrite=overwrite) if video else nullcontext()
-    with drawing as write:
-        results = _follow(
-            frames, follower, lambda frame: _camera(map_, source, frame, given), map_.box, write
-        )
+    localizer = Localizer(read_map(map), localization)
+    results = track_video(
+        localizer, source, tracker, camera=given, video=video, overwrite=overwrite, progress=_shown
+    )
     write_poses(output, {name: one.localization for name, one in results.items()}, overwrite=overwrite)
     _sum_up(output, list(results.values()))
-    finish(f"{video or output}: {len(results)} frames", watch, "info", map)
-
-
-def _follow(
-    frames: FrameSource,
-    tracker: Tracker,
-    camera_of: Callable[[VideoFrame], pycolmap.Camera],
-    box: Box,
-    write: Callable[[Image], None] | None,
-) -> dict[str, Tracked]:
-    """Track all frames, and draw them if there is somebody to write them; Ctrl-C ends a camera's.
-
-    A frame of a camera that was begun is finished first, so that poses and video end with the same one.
-    """
-    results: dict[str, Tracked] = {}
-    camera = None
-    try:
-        for frame in _shown(frames):
-            camera = camera or camera_of(frame)
-            _check_size(frame, camera)
-            with uninterrupted() if frames.is_live else nullcontext():
-                results[frame.name] = tracker.track(frame.image, camera)
-                if write:
-                    write(_drawn(frame.image, results[frame.name], box, camera))
-    except KeyboardInterrupt:
-        if not (frames.is_live and results):
-            raise
-    if not results:
-        raise InputError("the video holds no frame")
-    return results
+    finish(f"{video or output}: {plural(len(results), 'frame')}", watch)
 
 
 def _shown(frames: FrameSource) -> Iterator[VideoFrame]:
@@ -115,49 +78,10 @@ def _shown(frames: FrameSource) -> Iterator[VideoFrame]:
             bars.update(task, advance=1, description=f"track {bars.tasks[0].speed or 0:.0f}/s")
 
 
-def _camera(map: Map, source: str, frame: VideoFrame, given: pycolmap.Camera | None) -> pycolmap.Camera:
-    """The intrinsics of all frames, told by the first: given, of the map, or EXIF's."""
-    if Path(source).is_dir():
-        return query_camera(map, Path(source) / frame.name, given)
-    height, width = frame.image.shape[:2]
-    known = given or map.shared_camera
-    camera = known and scaled_camera(known, width, height)
-    if camera is None:
-        whose = f"is not of --camera {given.width}x{given.height}" if given else "has an unknown focal length"
-        raise InputError(f"{source}: {width}x{height} pixels, {whose}; give --camera FILE of this video")
-    return camera
-
-
-def _check_size(frame: VideoFrame, camera: pycolmap.Camera) -> None:
-    height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise InputError(
-            f"frame {frame.name} has {width}x{height} pixels, the first {camera.width}x{camera.height}; "
-            "frames must be of one size"
-        )
-
-
-def _drawn(image: Image, tracked: Tracked, box: Box, camera: pycolmap.Camera) -> Image:
-    """The frame with the object's box; none where it is lost."""
-    if tracked.pose is None:
-        return image
-    boxed = image.copy()
-    thickness = max(2, round(max(image.shape) / 320))
-    draw_box(boxed, box, tracked.pose.cam_from_world, camera, TRUE_RGB, thickness=thickness)
-    confidence = tracked.pose.confidence
-    opacity = 1.0 if confidence is None else max(confidence, _FAINTEST)
-    return np.asarray(cv2.addWeighted(boxed, opacity, image, 1 - opacity, 0), np.uint8)
-
-
 def _sum_up(output: Path, results: Sequence[Tracked]) -> None:
     number = {state: sum(one.state == state for one in results) for state in ("tracked", "localized", "lost")}
     rate = len(results) / sum(one.seconds for one in results)
     console.print(
-        f"{output}: {number['tracked']} frames tracked, {number['localized']} localized on their own, "
-        f"{number['lost']} lost; {rate:.0f} frames a second"
+        f"{output}: {plural(number['tracked'], 'frame')} tracked, {number['localized']} localized from "
+        f"scratch, {number['lost']} lost; {rate:.0f} frames per second"
     )
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(track, arguments)

@@ -1,12 +1,12 @@
 """`slimsfm view`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from time import sleep
 from typing import Annotated
 
 from slimsfm.cli.networks import Networks
-from slimsfm.cli.output import Flat, MapPath, console, parse
+from slimsfm.cli.options import Advanced, MapPath
+from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.localization.cameras import FocalLength, read_camera
 from slimsfm.mapping.io import bytes_by_part, read_map
@@ -21,7 +21,7 @@ def view(
     queries: Path | None = None,
     camera: Path | None = None,
     focal: FocalLength = "known",
-    networks: Annotated[Networks, Flat] = Networks(),
+    networks: Annotated[Networks, Advanced()] = Networks(),
     port: int = 8080,
     host: str = "localhost",
 ) -> None:
@@ -62,8 +62,3 @@ def view(
                 sleep(3600)
     except KeyboardInterrupt:
         print("stopped")  # rich would repeat a line whose printing was interrupted
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Run the command."""
-    parse(view, arguments)

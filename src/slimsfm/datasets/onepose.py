@@ -71,7 +71,7 @@ FrameKind = Literal["full", "cropped"]
 
 _SPLITS = ("train_data", "val_data", "test_data", "sample_data", "lowtexture_test_data")
 
-_MORE_FRAMES = "; if a video has more frames than poses, read the crops (frames: cropped)"
+_MORE_FRAMES = "; if a video has more frames than poses, read the crops (`frames='cropped'`)"
 
 _CORNER_ORDER = [0, 4, 5, 1, 2, 6, 7, 3]
 """Index in `Box.corners` of the k-th corner of the file."""
@@ -190,7 +190,7 @@ def read_sequence(directory: Path, *, frame_step: int = 1, frames: FrameKind = "
     if frames == "full" and not folder.is_dir() and (directory / "color").is_dir():
         raise InputError(
             f"{folder} is missing: extract the full frames from Frames.m4v with the authors' video2img.py, "
-            "or read the crops (frames: cropped)"
+            "or read the crops (`frames='cropped'`)"
         )
     images, poses = numbered(folder, ".png"), numbered(directory / "poses_ba", ".txt")
     check_paired(images, poses, "pose", "" if frames == "cropped" else _MORE_FRAMES)

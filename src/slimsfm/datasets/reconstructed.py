@@ -176,7 +176,7 @@ def query_names(names: list[str], every: int) -> list[str]:
     references = len(names) - len(queries)
     if not queries or references < TWO_VIEWS:
         raise InputError(
-            f"query_every {every} leaves {references} reference{'' if references == 1 else 's'} of "
+            f"`query_every={every}` leaves {references} reference{'' if references == 1 else 's'} of "
             f"{len(names)} images; at least one query and two references are required"
         )
     return queries

@@ -134,7 +134,7 @@ def _claim(folder: Path, description: dict, *, overwrite: bool) -> None:
     if known is not None:
         if not overwrite:
             raise OutputError(
-                f"{folder}: holds a run with other options; choose another output or set overwrite"
+                f"{folder}: holds a run with other options; choose another output or pass `overwrite=True`"
             )
         remove(folder)
     write_json(folder / "run.json", description)

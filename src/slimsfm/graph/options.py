@@ -94,7 +94,7 @@ def resolve_edges(map: Map, options: GraphOptions) -> str:
         InputError: `options.edges` is "matches" and the map has no matches.
     """
     if options.edges == "matches" and not map.matches:
-        raise InputError("the map has no matches; set edges to tracks or localize")
+        raise InputError("the map has no matches; use `edges='tracks'` or `edges='localize'`")
     if options.edges != "auto":
         return options.edges
     return "matches" if map.matches else "tracks"

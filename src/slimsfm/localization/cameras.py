@@ -106,8 +106,8 @@ def query_camera(
     scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
     if given and scaled is None:
         raise UnknownIntrinsicsError(
-            f"{path}: has {exif.width}x{exif.height} pixels, but the given camera "
-            f"{given.width}x{given.height}; give the camera of this image"
+            f"{path}: has {exif.width}x{exif.height} pixels, but the given camera {given.width}x{given.height}; "
+            "give the camera of this image"
         )
     if scaled and (given or not exif.has_prior_focal_length or _same_focal(exif, scaled)):
         return scaled
@@ -116,7 +116,7 @@ def query_camera(
     if focal == "known":
         raise UnknownIntrinsicsError(
             f"{path}: its focal length is unknown (no EXIF data, and not taken with the map's camera); "
-            "give the camera of this image, or estimate the focal length"
+            "give `camera=FILE`, or estimate it with `focal='unknown'`"
         )
     return guess_camera(exif.width, exif.height)
 

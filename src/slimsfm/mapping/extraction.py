@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pycolmap
 from jaxtyping import Float64, UInt8
-from scipy.spatial import KDTree
 
 from slimsfm.arrays import GrayImage
 from slimsfm.errors import ImageError, InputError, ModelError
@@ -66,7 +65,7 @@ def _check_equal_sizes(guesses: dict[str, pycolmap.Camera]) -> None:
         (size_a, a), (size_b, b) = list(sizes.items())[:2]
         raise InputError(
             f"{a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
-            "images that share a camera must have the same size, so let the cameras be 'auto'"
+            "images that share a camera must have the same size, so use `camera='auto'`"
         )
 
 
@@ -177,6 +176,8 @@ def _describe(
     if not detected or not len(keypoints):
         return descriptors
     pixels = np.array([one.pt for one in detected]) + 0.5
+    from scipy.spatial import KDTree  # slow to import, and only needed here
+
     distances, rows_nearest = KDTree(pixels).query(keypoints)
     nearest = np.asarray(rows_nearest)
     rows = np.flatnonzero(distances < _REACH_PX)

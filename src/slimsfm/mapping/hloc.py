@@ -44,7 +44,7 @@ def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overw
     if map.is_for_direct_matching:
         raise MapError(
             "the map is for direct matching alone, and hloc matches images; "
-            "export the full map, or one that is reduced for matching images"
+            "reduce the full map for images instead"
         )
     pairs = _pairs(queries, map)
     with replacing(Path(path), overwrite=overwrite) as partial:

@@ -125,8 +125,8 @@ def _database_next_to(model_path: Path) -> Path:
     found = [folder / "database.db" for folder in folders if (folder / "database.db").is_file()]
     if not found:
         raise InputError(
-            f"{model_path}: no database.db next to the model; give the source of its descriptors: a COLMAP "
-            "database, hloc's features or a folder of images"
+            f"{model_path}: no database.db next to the model; give the source of its descriptors: "
+            "`database=FILE`, `features=FILE` (hloc) or `images=DIR`"
         )
     return found[0]
 

@@ -32,9 +32,7 @@ def keep_images(map: Map, names: Iterable[str], *, min_track_length: int = 1) ->
         raise InputError("no image to keep was given")
     for name in kept:
         if name not in map.images:
-            raise InputError(
-                f"image {name!r} is not in the map; `slimsfm info MAP --images` lists its images"
-            )
+            raise InputError(f"image {name!r} is not one of the {len(map.images)} images of the map")
     chosen = frozenset(kept)
     features: Mapping[str, Features] = FilteredMapping(map.features, chosen.__contains__)
     matches: Mapping[tuple[str, str], IndexPairs] = FilteredMapping(map.matches, chosen.issuperset)

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
 
 from slimsfm.evaluation.scores import Interval
-from slimsfm.evaluation.table import Row
+from slimsfm.evaluation.table import Row, format_bytes
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.reduction import Candidate, Frontier
 from slimsfm.report.figures import COLORS, INK, PAPER, mark_logarithmic, new_figure, styled

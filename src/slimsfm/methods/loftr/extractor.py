@@ -132,7 +132,7 @@ def choose_image_pairs(
     if choice == "similar":
         raise InputError(
             "pairs of similar images are found by local features, which this extractor does not have; "
-            "set pairs to exhaustive or sequential"
+            "use `pairs='exhaustive'` or `pairs='sequential'`"
         )
     if choice == "exhaustive" or (choice == "auto" and len(names) <= _MOST_EXHAUSTIVE):
         return exhaustive_pairs(names)
