@@ -11,10 +11,9 @@ from pathlib import Path
 
 from PIL import Image as PilImage
 from PIL import ImageDraw, ImageFont
-from slimsfm.report.query_video import FRAMES_PER_SECOND
 
 from benchmark_scenes import rendered
-from film import Film, film
+from film import FRAMES_PER_SECOND, Film, film
 from slimsfm.arrays import Image
 from slimsfm.files import replacing
 from slimsfm.localization import Localizer

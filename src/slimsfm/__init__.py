@@ -17,7 +17,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from slimsfm.localization import Localization, LocalizationOptions, Localizer, MultiLocalizer
+    from slimsfm.localization import (
+        Localization,
+        LocalizationOptions,
+        Localizer,
+        MultiLocalizer,
+        localize_images,
+        localize_objects,
+    )
     from slimsfm.localization.pose_files import write_poses
     from slimsfm.mapping import (
         BuildOptions,
@@ -29,14 +36,23 @@ if TYPE_CHECKING:
         write_map,
     )
     from slimsfm.photos import read_image
-    from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
-    from slimsfm.reduction import FrontierOptions, frontier
+    from slimsfm.pose import Gravity, PoseEstimate, RansacOptions, estimate_pose, refine_pose
+    from slimsfm.reduction import (
+        FrontierOptions,
+        ImageOptions,
+        ReduceOptions,
+        ReductionLimits,
+        frontier,
+        reduce,
+    )
     from slimsfm.report.tracked_video import track_video
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 
 _MODULES = {
     "BuildOptions": "slimsfm.mapping",
     "FrontierOptions": "slimsfm.reduction",
+    "Gravity": "slimsfm.pose",
+    "ImageOptions": "slimsfm.reduction",
     "ImportOptions": "slimsfm.mapping",
     "Localization": "slimsfm.localization",
     "LocalizationOptions": "slimsfm.localization",
@@ -45,6 +61,8 @@ _MODULES = {
     "MultiLocalizer": "slimsfm.localization",
     "PoseEstimate": "slimsfm.pose",
     "RansacOptions": "slimsfm.pose",
+    "ReduceOptions": "slimsfm.reduction",
+    "ReductionLimits": "slimsfm.reduction",
     "Tracked": "slimsfm.tracking",
     "Tracker": "slimsfm.tracking",
     "TrackerOptions": "slimsfm.tracking",
@@ -52,8 +70,12 @@ _MODULES = {
     "estimate_pose": "slimsfm.pose",
     "frontier": "slimsfm.reduction",
     "import_colmap": "slimsfm.mapping",
+    "localize_images": "slimsfm.localization",
+    "localize_objects": "slimsfm.localization",
     "read_image": "slimsfm.photos",
     "read_map": "slimsfm.mapping",
+    "reduce": "slimsfm.reduction",
+    "refine_pose": "slimsfm.pose",
     "track_video": "slimsfm.report.tracked_video",
     "write_map": "slimsfm.mapping",
     "write_poses": "slimsfm.localization.pose_files",
@@ -63,6 +85,8 @@ _MODULES = {
 __all__ = [
     "BuildOptions",
     "FrontierOptions",
+    "Gravity",
+    "ImageOptions",
     "ImportOptions",
     "Localization",
     "LocalizationOptions",
@@ -71,6 +95,8 @@ __all__ = [
     "MultiLocalizer",
     "PoseEstimate",
     "RansacOptions",
+    "ReduceOptions",
+    "ReductionLimits",
     "Tracked",
     "Tracker",
     "TrackerOptions",
@@ -78,8 +104,12 @@ __all__ = [
     "estimate_pose",
     "frontier",
     "import_colmap",
+    "localize_images",
+    "localize_objects",
     "read_image",
     "read_map",
+    "reduce",
+    "refine_pose",
     "track_video",
     "write_map",
     "write_poses",

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-import tyro
-
 from slimsfm.cli.choices import kept_graph, print_change, print_dominating_set, promise, read_reducible
 from slimsfm.cli.execution import Execution
-from slimsfm.cli.options import Advanced, MapPath, OutputPath
+from slimsfm.cli.options import Advanced, Flags, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.cli.units import LimitArguments
 from slimsfm.mapping.io import write_map
@@ -21,7 +19,7 @@ from slimsfm.reduction.reduced import Use
 class ReduceArguments:
     """How to choose what is kept."""
 
-    for_: Annotated[Use | None, tyro.conf.arg(name="for")] = None
+    for_: Annotated[Use | None, Flags(("--for",))] = None
     """Match queries with points (direct), with images (images), or with either (both). By default images if
     an option below chooses images, else direct. With both, limits hold for each part."""
 

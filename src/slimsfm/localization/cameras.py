@@ -106,8 +106,8 @@ def query_camera(
     scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
     if given and scaled is None:
         raise UnknownIntrinsicsError(
-            f"{path}: has {exif.width}x{exif.height} pixels, but the given camera {given.width}x{given.height}; "
-            "give the camera of this image"
+            f"{path}: has {exif.width}x{exif.height} pixels, but the given camera "
+            f"{given.width}x{given.height}; give the camera of this image"
         )
     if scaled and (given or not exif.has_prior_focal_length or _same_focal(exif, scaled)):
         return scaled
