@@ -10,7 +10,7 @@ from slimsfm.datasets.base import LoadOptions, map_object
 from slimsfm.datasets.onepose import read_object
 from slimsfm.datasets.reconstructed import Images
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
-from slimsfm.evaluation.protocol import PreparedQuery, prepare_queries, queries_of
+from slimsfm.evaluation.results import PreparedQuery, prepare_queries, queries_of
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 
 from benchmark_scenes import Scene, scenes
 from deceptive_scenes import deceptions
-from slimsfm.evaluation.protocol import PreparedQuery
+from slimsfm.evaluation.results import PreparedQuery
 from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points

@@ -14,10 +14,23 @@ import pycolmap
 import trimesh
 from jaxtyping import Float64
 
-from slimsfm.synthetic import shapes, texture, trajectory
+from slimsfm.synthetic import shapes, texture
 from slimsfm.synthetic.objects import printed_box
 from slimsfm.synthetic.render import Light, Scene
-from slimsfm.synthetic.scene import EVENING, Take, elsewhere, phone_camera, posts, things, viewing_distance
+from slimsfm.synthetic.scene import (
+    EVENING,
+    Take,
+    Vector,
+    elsewhere,
+    eyes,
+    look_at,
+    mapping_path,
+    phone_camera,
+    posts,
+    query_path,
+    things,
+    viewing_distance,
+)
 from slimsfm.synthetic.texture import Picture
 
 FLOOR_PERIOD, WALL_PERIOD = 0.12, 0.10
@@ -131,7 +144,7 @@ def twins(frames: int, width: int, height: int, seed: int) -> Take:
     """A printed box alone on a marbled table."""
     mesh = printed_box(seed)
     scene = Scene([mesh, _marble(mesh, seed)], Light())
-    poses = trajectory.mapping_path(frames, 1.1 * viewing_distance(mesh))
+    poses = mapping_path(frames, 1.1 * viewing_distance(mesh))
     return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "twins", _MAPPING))
 
 
@@ -140,7 +153,7 @@ def twins_query(frames: int, width: int, height: int, seed: int) -> Take:
     rng, mesh = _rng(seed, "twins", _QUERY), printed_box(seed)
     twin = mesh.copy().apply_transform(np.vstack([TWIN_FROM_OBJECT.matrix(), (0, 0, 0, 1)]))
     scene = Scene([mesh, _marble(mesh, seed), twin, *things(rng, mesh)], EVENING)
-    around = trajectory.query_path(rng, frames, 1.5 * viewing_distance(mesh))
+    around = query_path(rng, frames, 1.5 * viewing_distance(mesh))
     share = 0.5 + 0.5 * np.sin(2 * np.pi * 3.1 * (np.arange(frames) + 0.5) / frames)
     shifts = [pycolmap.Rigid3d(pycolmap.Rotation3d(), -s * TWIN_FROM_OBJECT.translation) for s in share]
     poses = [pose * shift for pose, shift in zip(around, shifts, strict=True)]
@@ -167,7 +180,7 @@ def mirrored_box(frames: int, width: int, height: int, seed: int) -> Take:
     rng, mesh = _rng(seed, "mirrored_box", _MAPPING), ambiguous_box(seed)
     wood = texture.tinted_noise(rng, 512, 512, (186, 178, 168), 0.16)
     scene = Scene([mesh, shapes.ground(2.4, wood, shapes.lowest(mesh))], Light())
-    poses = trajectory.mapping_path(frames, viewing_distance(mesh))
+    poses = mapping_path(frames, viewing_distance(mesh))
     return _take(scene, phone_camera(width, height, 0.0), poses, _key(seed, "mirrored_box", _MAPPING))
 
 
@@ -175,7 +188,7 @@ def mirrored_box_query(frames: int, width: int, height: int, seed: int) -> Take:
     """The ambiguous box on another table, in other light, with clutter around it and posts in front of it."""
     rng, mesh = _rng(seed, "mirrored_box", _QUERY), ambiguous_box(seed)
     scene = elsewhere(rng, mesh)
-    poses = trajectory.query_path(rng, frames, 1.4 * viewing_distance(mesh))
+    poses = query_path(rng, frames, 1.4 * viewing_distance(mesh))
     return _take(scene, phone_camera(width, height, 0.02), poses, _key(seed, "mirrored_box", _QUERY))
 
 
@@ -242,11 +255,11 @@ def _views(
 ) -> Float64[np.ndarray, "n 3"]:
     """Eyes around the origin; a sweep from 0 to 1 covers all azimuths with a wall behind the object."""
     azimuths = _ROOM[0] + (_ROOM[1] - _ROOM[0]) * sweep
-    return trajectory.eyes(np.radians(azimuths), np.radians(elevations_deg), radii)
+    return eyes(np.radians(azimuths), np.radians(elevations_deg), radii)
 
 
-def _aim(eye: trajectory.Vector, aim: Float64[np.ndarray, "2"], roll_deg: float) -> pycolmap.Rigid3d:
+def _aim(eye: Vector, aim: Float64[np.ndarray, "2"], roll_deg: float) -> pycolmap.Rigid3d:
     """Look past the origin, which appears off-center by `aim`, in focal lengths to the right and down."""
     towards = np.array([-aim[0], -aim[1], 1.0]) * np.linalg.norm(eye)
-    target = trajectory.look_at(eye, np.zeros(3)).inverse() * towards
-    return trajectory.look_at(eye, target, roll_deg)
+    target = look_at(eye, np.zeros(3)).inverse() * towards
+    return look_at(eye, target, roll_deg)

@@ -21,7 +21,7 @@ from deception import DECEPTIONS
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
 from slimsfm.datasets.base import map_object
-from slimsfm.evaluation.protocol import evaluate, prepare_queries, queries_of
+from slimsfm.evaluation.results import evaluate, prepare_queries, queries_of
 from slimsfm.evaluation.scores import score
 from slimsfm.execution import processes
 from slimsfm.files import replacing

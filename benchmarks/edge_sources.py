@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmark_scenes import Scene, scenes
 from slimsfm.domination import DominationProblem, exact
-from slimsfm.evaluation.protocol import evaluate
+from slimsfm.evaluation.results import evaluate
 from slimsfm.evaluation.scores import add_percent
 from slimsfm.graph import GraphOptions, GraphRun, compute_graph
-from slimsfm.graph.candidates import all_pairs, likely_pairs
+from slimsfm.graph.edge_sources import all_pairs, likely_pairs
 from slimsfm.mapping import Map, keep_images
 from slimsfm.progress import shown
 

@@ -11,11 +11,13 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Image
 from slimsfm.geometry import Box
-from slimsfm.synthetic import shapes, texture, trajectory
+from slimsfm.synthetic import shapes, texture
 from slimsfm.synthetic.objects import OBJECTS
 from slimsfm.synthetic.render import Light, Scene, render, visible_meshes
 from slimsfm.synthetic.scene import (
     elsewhere,
+    eyes,
+    look_at,
     object_box,
     phone_camera,
     textured_object,
@@ -133,14 +135,14 @@ def _path(rng: np.random.Generator, frames: int, cut: int, radius: float) -> lis
     azimuths = 0.6 - 0.3 * time + 2.4 * after + np.radians(_tremor(rng, time, 1.0))
     elevations = np.radians(34 + 9 * np.sin(2 * np.pi * time / 7.3) + 12 * after)
     radii = radius * (1 + 0.12 * np.sin(2 * np.pi * time / 5.1) - 0.08 * after)
-    eyes = trajectory.eyes(azimuths, elevations, radii)
+    eyes = eyes(azimuths, elevations, radii)
     fast = _pass(share, _PANS)
     pans = _PAN * fast * np.sin(2 * np.pi * _PAN_HZ * time) + _tremor(rng, time, 0.8)
     tilts = 3 * fast * np.sin(2 * np.pi * 0.8 * time) + _tremor(rng, time, 0.8)
     rolls = _ROLL * _pass(share, _ROLLS) * np.sin(2 * np.pi * _ROLL_HZ * time) + _tremor(rng, time, 1.0)
     turns = np.radians(np.stack([tilts, pans, np.zeros(frames)], axis=1))
     return [
-        _turned(turn) * trajectory.look_at(eye, np.zeros(3), float(roll))
+        _turned(turn) * look_at(eye, np.zeros(3), float(roll))
         for eye, turn, roll in zip(eyes, turns, rolls, strict=True)
     ]
 

@@ -22,15 +22,22 @@ from random_weights import write_random_weights
 from slimsfm.cli.output import quiet
 from slimsfm.datasets.base import ObjectSequences, map_object
 from slimsfm.datasets.onepose import read_object
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, outcomes_of, prepare_queries, queries_of
-from slimsfm.evaluation.results import Outcomes, join_outcomes
+from slimsfm.evaluation.results import (
+    Outcomes,
+    PreparedQuery,
+    evaluate,
+    join_outcomes,
+    outcomes_of,
+    prepare_queries,
+    queries_of,
+)
 from slimsfm.evaluation.scores import Scores, score
 from slimsfm.features import Features
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.build import BuildOptions
-from slimsfm.mapping.photo_file import shrink_photo
+from slimsfm.mapping.io import shrink_photo
 from slimsfm.mapping.subset import keep_images
 from slimsfm.methods.loftr.matcher import Loftr
 from slimsfm.methods.superpoint import SuperPoint, describe_pixels

@@ -27,7 +27,7 @@ from slimsfm.cli import run
 from slimsfm.cli.output import quiet
 from slimsfm.datasets import onepose
 from slimsfm.datasets.base import map_object
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries, queries_of
+from slimsfm.evaluation.results import PreparedQuery, evaluate, prepare_queries, queries_of
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import ReferenceGraph, compute_graph
 from slimsfm.mapping import Map, keep_images, read_map, write_map
@@ -35,8 +35,7 @@ from slimsfm.reduction import DominatingSetOptions, dominating_set
 from slimsfm.synthetic import shapes, texture
 from slimsfm.synthetic.objects import OBJECTS
 from slimsfm.synthetic.render import Light, Scene
-from slimsfm.synthetic.scene import Take, mapping_take, object_box
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import Take, look_at, mapping_take, object_box
 
 WIDTH, HEIGHT, SEED = 640, 480, 0
 REFERENCES, QUERIES = 50, 40

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmark_scenes import Scene, scenes
-from slimsfm.evaluation.protocol import evaluate
+from slimsfm.evaluation.results import evaluate
 from slimsfm.evaluation.scores import score
 from slimsfm.graph import GraphOptions, compute_graph
 from slimsfm.localization.point_descriptors import describe_points
@@ -32,8 +32,7 @@ from slimsfm.reduction import (
     reduce,
 )
 from slimsfm.selection import SELECTORS
-from slimsfm.selection.leave_one_out import LeftOut
-from slimsfm.selection.usable_points import selection_problem
+from slimsfm.selection.usable_points import LeftOut, selection_problem
 from slimsfm.synthetic.objects import OBJECTS
 
 BUDGETS = (100, 200, 400, 800, 1600, 3200)

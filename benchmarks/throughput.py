@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from slimsfm.datasets.onepose import read_object
-from slimsfm.evaluation.protocol import PosedQuery, queries_of
+from slimsfm.evaluation.results import PosedQuery, queries_of
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer

@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 
 from slimsfm.geometry import project
-from slimsfm.methods.loftr.image_matching import ImageMatches
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.methods.loftr.cells import ImageMatches
+from slimsfm.synthetic.scene import look_at
 
 RADIUS = 1.0
 _FACING = 0.35  # cosine between a surface and the view below which it is not matched

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from slimsfm.features import load_extractor
 from slimsfm.geometry import Box
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 WIDTH, HEIGHT = 320, 240
 _SIDE_PX = 400

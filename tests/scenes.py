@@ -10,7 +10,7 @@ from slimsfm.features import Features
 from slimsfm.geometry import Box, project
 from slimsfm.graph import GraphOptions, ReferenceGraph, compute_graph
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 BOX = Box(np.zeros(3), np.diag([1.0, 0.8, 0.6]))
 ALGORITHM_1 = GraphOptions(edges="localize", candidates="all")  # as the paper states it

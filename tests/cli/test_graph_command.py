@@ -9,7 +9,7 @@ import pytest
 
 from commands import contents, slimsfm
 from slimsfm import execution
-from slimsfm.cli.execution import Execution
+from slimsfm.cli.arguments import Execution
 from slimsfm.domination import dominates
 from slimsfm.errors import WorkError
 from slimsfm.graph import EDGE_SOURCES, GraphOptions, compute_graph

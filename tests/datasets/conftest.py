@@ -17,8 +17,7 @@ from slimsfm.datasets.onepose import write_box
 from slimsfm.datasets.synthetic import Synthetic
 from slimsfm.geometry import Box, corner_error, project
 from slimsfm.mapping.map import Map
-from slimsfm.synthetic.scene import mapping_take
-from slimsfm.synthetic.trajectory import mapping_path
+from slimsfm.synthetic.scene import mapping_path, mapping_take
 
 BOX = Box(np.array([0.01, -0.02, 0.03]), np.diag([0.04, 0.03, 0.05]))
 POINTS = np.concatenate([BOX.corners, np.random.default_rng(0).uniform(-0.03, 0.03, (20, 3))])

@@ -6,7 +6,7 @@ from PIL import Image
 from slimsfm.datasets import onepose
 from slimsfm.errors import ImageError, InputError
 from slimsfm.geometry import Box, corner_error
-from slimsfm.synthetic.trajectory import mapping_path
+from slimsfm.synthetic.scene import mapping_path
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=16, height=12, params=[15.25, 15.5, 8.125, 5.875])
 BOX = Box(np.zeros(3), np.diag([0.08, 0.035, 0.11]))

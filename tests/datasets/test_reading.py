@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from slimsfm.datasets.object_model import largest_distance
+from slimsfm.datasets.base import largest_distance
 from slimsfm.datasets.reading import folders, image_size, numbered, pinhole_camera, rigid
 from slimsfm.errors import InputError
-from slimsfm.synthetic.trajectory import mapping_path
+from slimsfm.synthetic.scene import mapping_path
 
 SIDEWAYS = 6  # EXIF's orientation of a photo taken upright
 

@@ -9,7 +9,7 @@ from digraphs import best_merit, every_solver, needs_ortools, problem_parts, pro
 from hypothesis import given, settings
 
 from slimsfm.domination import DominationProblem, cpsat, exact, greedy
-from slimsfm.domination.solution import merit
+from slimsfm.domination.problem import merit
 from slimsfm.errors import SlimsfmError
 
 quick = settings(deadline=None, max_examples=25)

@@ -6,8 +6,15 @@ import numpy as np
 import pycolmap
 
 from scenes import BOX
-from slimsfm.evaluation.protocol import PosedQuery
-from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, Outcomes, Run
+from slimsfm.evaluation.results import (
+    MappedObject,
+    MapRun,
+    Measurement,
+    ObjectResult,
+    Outcomes,
+    PosedQuery,
+    Run,
+)
 
 FULL, DOMINATING = ("sift", "exhaustive", "full"), ("sift", "exhaustive", "dominating")
 

@@ -13,8 +13,7 @@ from slimsfm.evaluation.benchmark import (
     graph_options,
     parse_method,
 )
-from slimsfm.evaluation.protocol import evaluate, prepare_queries
-from slimsfm.evaluation.results import map_path
+from slimsfm.evaluation.results import evaluate, map_path, prepare_queries
 from slimsfm.evaluation.table import rows_of
 from slimsfm.geometry import corner_error
 from slimsfm.graph.compute import load_or_compute_graph

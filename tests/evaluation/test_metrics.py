@@ -8,7 +8,7 @@ from handmade import random_pose, rigid
 
 from scenes import BOX
 from slimsfm.datasets.base import ObjectModel
-from slimsfm.evaluation.protocol import NO_POSE, PoseError, model_error, pose_error
+from slimsfm.evaluation.results import NO_POSE, PoseError, model_error, pose_error
 from slimsfm.evaluation.scores import add_percent, deg_cm_percent, within_deg_cm, wrong_when_sure
 from slimsfm.geometry import Box
 

@@ -7,8 +7,7 @@ from handmade import outcomes_like, rigid
 
 from scenes import BOX
 from slimsfm.datasets.base import ObjectModel
-from slimsfm.evaluation.protocol import outcomes_of
-from slimsfm.evaluation.results import join_outcomes
+from slimsfm.evaluation.results import join_outcomes, outcomes_of
 from slimsfm.localization import Localization, Seconds
 from slimsfm.pose import PoseEstimate
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from scenes import camera, exact_map
-from slimsfm.evaluation.protocol import (
+from slimsfm.evaluation.results import (
     PosedQuery,
     PreparedQuery,
     evaluate,

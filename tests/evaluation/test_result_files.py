@@ -8,7 +8,6 @@ from handmade import FULL, measurement_like, random_pose, result_like, run_like
 
 from scenes import camera
 from slimsfm.errors import InputError
-from slimsfm.evaluation.protocol import PosedQuery
 from slimsfm.evaluation.result_files import (
     digest_of,
     object_to_json,
@@ -17,7 +16,7 @@ from slimsfm.evaluation.result_files import (
     run_to_json,
     write_json,
 )
-from slimsfm.evaluation.results import MapRun, Measurement, Outcomes
+from slimsfm.evaluation.results import MapRun, Measurement, Outcomes, PosedQuery
 from slimsfm.geometry import Box
 
 QUERIES = 20

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slimsfm.features import unit_rows
-from slimsfm.features.vlad import NUM_WORDS, learn_words, nearest_word, vlad
+from slimsfm.features.nearest import NUM_WORDS, learn_words, nearest_word, vlad
 
 
 def descriptors(count, seed=0):

@@ -9,8 +9,8 @@ import pytest
 from scenes import exact_map
 from slimsfm.features import Features
 from slimsfm.graph import GraphOptions, GraphRun, ReferenceGraph, compute_graph
-from slimsfm.graph.candidates import all_pairs, covisible_pairs, likely_pairs
 from slimsfm.graph.compute import estimate_recall
+from slimsfm.graph.edge_sources import all_pairs, covisible_pairs, likely_pairs
 
 LIKELY = GraphOptions(edges="localize", candidates="likely")
 ALL = replace(LIKELY, candidates="all")

@@ -13,10 +13,9 @@ import pytest
 from scenes import ALGORITHM_1, algorithm_1, exact_map
 from slimsfm.errors import OutputError
 from slimsfm.graph import GraphOptions
-from slimsfm.graph.candidates import all_pairs
 from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.edge_sources import all_pairs, graph_key
 from slimsfm.graph.io import Checkpoint
-from slimsfm.graph.options import graph_key
 from slimsfm.mapping.io import read_map
 
 KEY = "0123456789abcdef" * 4

@@ -9,8 +9,8 @@ from slimsfm.errors import InputError
 from slimsfm.geometry import Box
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.graph.edge_sources import graph_key
 from slimsfm.graph.io import read_given_graph, write_graph
-from slimsfm.graph.options import graph_key
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.pose import RansacOptions

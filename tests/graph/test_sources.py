@@ -10,8 +10,7 @@ import pytest
 from scenes import exact_map, with_matches
 from slimsfm.errors import InputError
 from slimsfm.graph import EDGE_SOURCES, EdgeSource, GraphOptions, compute_graph
-from slimsfm.graph.edge_sources import HybridEdges, LocalizeEdges, MatchEdges
-from slimsfm.graph.options import edge_source, resolve_edges
+from slimsfm.graph.edge_sources import HybridEdges, LocalizeEdges, MatchEdges, edge_source, resolve_edges
 from slimsfm.mapping.subset import keep_images
 
 EXACT = 1e-4

@@ -9,7 +9,7 @@ from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.localization.progressive import choose_landmarks
+from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import observed
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scenes import BOX, camera, poses
 from slimsfm.errors import InputError
 from slimsfm.geometry import project
-from slimsfm.mapping.box import estimate_box, read_box
+from slimsfm.mapping.model import estimate_box, read_box
 
 
 def write_json(path, value):

@@ -15,7 +15,7 @@ from slimsfm.methods.onepose.crop import (
     locate_object,
     region_by_matches,
 )
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 
 def region(left, top, right, bottom) -> Region:

@@ -11,12 +11,10 @@ from slimsfm.cli.output import quiet
 from slimsfm.errors import InputError
 from slimsfm.geometry import reprojection_errors
 from slimsfm.mapping.pairs import exhaustive_pairs
-from slimsfm.methods.loftr.cells import in_tiles, match_without_keypoints
+from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher, in_tiles, match_without_keypoints
 from slimsfm.methods.loftr.extractor import choose_image_pairs, neighboring_pairs
-from slimsfm.methods.loftr.image_matching import EncodedImage, ImageMatcher
 from slimsfm.methods.loftr.mapping import KeypointFreeModel, build_without_keypoints
-from slimsfm.methods.loftr.rays import rays_of, refine_depths
-from slimsfm.methods.loftr.tracks import choose_references, read_tracks
+from slimsfm.methods.loftr.rays import choose_references, rays_of, read_tracks, refine_depths
 
 POSES = ring_of_cameras(6)
 NAMES = [f"{number}.png" for number in range(len(POSES))]

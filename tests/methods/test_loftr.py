@@ -8,7 +8,7 @@ pytest.importorskip("kornia")
 
 from networks.seeded import fill  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.methods.loftr.image_matching import EncodedImage, ImageMatcher  # noqa: E402
+from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher  # noqa: E402
 from slimsfm.methods.loftr.matcher import Loftr  # noqa: E402
 from slimsfm.methods.loftr.network import coarse_tokens, confidences, make_network  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402

@@ -13,8 +13,8 @@ from scenes import BOX, camera, exact_map, poses  # noqa: E402
 from slimsfm.errors import InputError, MapError  # noqa: E402
 from slimsfm.features import Features, unit_rows  # noqa: E402
 from slimsfm.geometry import corner_error, project  # noqa: E402
-from slimsfm.localization.direct import Direct  # noqa: E402
 from slimsfm.localization.search import Search  # noqa: E402
+from slimsfm.localization.strategies import Direct  # noqa: E402
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy  # noqa: E402
 from slimsfm.mapping.map import Map  # noqa: E402
 from slimsfm.mapping.subset import keep_images  # noqa: E402
@@ -22,7 +22,7 @@ from slimsfm.methods.onepose.crop import box_region  # noqa: E402
 from slimsfm.methods.onepose.network import GraphAttentionMatcher  # noqa: E402
 from slimsfm.methods.onepose.strategy import ObjectFinder, OnePoseStrategy, object_views  # noqa: E402
 from slimsfm.pose import RansacOptions, estimate_pose  # noqa: E402
-from slimsfm.synthetic.trajectory import look_at  # noqa: E402
+from slimsfm.synthetic.scene import look_at  # noqa: E402
 from slimsfm.weights import Runtime, use_runtime  # noqa: E402
 
 POINTS = 40

@@ -9,9 +9,9 @@ import pytest
 from slimsfm.features import NearestOptions
 from slimsfm.features.registry import plugins
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
-from slimsfm.localization.direct import Direct
 from slimsfm.localization.localizer import supports
 from slimsfm.localization.point_descriptors import describe_points
+from slimsfm.localization.strategies import Direct
 from slimsfm.mapping.subset import direct_map
 
 METRIC = NearestOptions(max_ratio=0.99, max_distance=1.1)

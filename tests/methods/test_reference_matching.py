@@ -18,11 +18,10 @@ from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.pairs import exhaustive_pairs
 from slimsfm.mapping.subset import keep_images
-from slimsfm.methods.loftr.extractor import DetectorFree
+from slimsfm.methods.loftr.extractor import DetectorFree, DetectorFreeMatching
 from slimsfm.methods.loftr.mapping import build_without_keypoints
-from slimsfm.methods.loftr.reference_matching import DetectorFreeMatching
 from slimsfm.pose import estimate_pose
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 from slimsfm.weights import FOLDER
 
 POSES = [*ring_of_cameras(5), look_at(np.array([3.5, 2.5, 0.9]), np.zeros(3))]  # the last is the query's

@@ -7,8 +7,11 @@ torch = pytest.importorskip("torch")
 from torch import nn  # noqa: E402
 
 from slimsfm.errors import InputError  # noqa: E402
-from slimsfm.networks.devices import choose_device  # noqa: E402
-from slimsfm.networks.loading import load_network, load_state  # noqa: E402
+from slimsfm.networks.loading import (  # noqa: E402
+    choose_device,
+    load_network,
+    load_state,
+)
 from slimsfm.weights import DEVICE, FOLDER, Runtime, use_runtime  # noqa: E402
 
 

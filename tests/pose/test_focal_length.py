@@ -9,7 +9,7 @@ from lenses import MODELS, distorted
 from scenes import BOX, camera, poses
 from slimsfm.geometry import corner_error
 from slimsfm.pose import FocalPrior, RansacOptions, estimate_pose, with_focal_length
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 UNCERTAINTIES = [None, 0.3]
 

@@ -11,7 +11,7 @@ from slimsfm.features import unit_rows
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import Prediction, Trials
 from slimsfm.reduction.forecast import handicap
-from slimsfm.selection.leave_one_out import LeftOut
+from slimsfm.selection.usable_points import LeftOut
 
 LOST_AT_MOST = 0.5
 

@@ -17,8 +17,8 @@ from slimsfm.reduction.image_sets import (
     image_order,
     images_within,
     keep_random_images,
+    rim_groups,
 )
-from slimsfm.reduction.rim import rim_groups
 
 ERRORS = [0.001, 0.02, 0.049, 0.05, 0.08, 0.3, np.inf]
 

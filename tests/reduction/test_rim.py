@@ -4,7 +4,7 @@ from scipy.sparse import csr_array
 
 from scenes import algorithm_1, exact_map
 from slimsfm.domination import DominationProblem, exact
-from slimsfm.reduction.rim import (
+from slimsfm.reduction.image_sets import (
     reach,
     rim_groups,
     rim_sectors,

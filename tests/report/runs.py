@@ -10,9 +10,18 @@ from PIL import Image
 
 from scenes import exact_map
 from slimsfm.evaluation.benchmark import BenchmarkOptions
-from slimsfm.evaluation.protocol import PosedQuery, PreparedQuery, localize_all, outcomes_of
 from slimsfm.evaluation.result_files import write_results
-from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, Run
+from slimsfm.evaluation.results import (
+    MappedObject,
+    MapRun,
+    Measurement,
+    ObjectResult,
+    PosedQuery,
+    PreparedQuery,
+    Run,
+    localize_all,
+    outcomes_of,
+)
 from slimsfm.evaluation.variants import VariantInputs, parse_variant
 from slimsfm.geometry import project
 from slimsfm.graph import GraphOptions

@@ -19,7 +19,7 @@ from slimsfm.report.sphere import (
     sphere_chart,
     view_directions,
 )
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 BOX = Box(np.array([1.0, 2.0, 3.0]), np.diag([0.3, 0.2, 0.1]))
 VERDICTS = ("right", "wrong", "not localized")

@@ -5,16 +5,15 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_problems import problem_of, problems, users
 
 from scenes import BOX, exact_map
-from selection.random_problems import problem_of, problems, users
 from slimsfm.geometry import project
 from slimsfm.pose import RansacOptions, estimate_pose, rms_corner_errors
 from slimsfm.selection import information
-from slimsfm.selection.leave_one_out import LeftOut
-from slimsfm.selection.pose_information import InformationChoice
 from slimsfm.selection.problem import PRIOR_SIGMA
-from slimsfm.selection.usable_points import selection_problem
+from slimsfm.selection.selectors import InformationChoice
+from slimsfm.selection.usable_points import LeftOut, selection_problem
 
 quick = settings(deadline=None, max_examples=40)
 

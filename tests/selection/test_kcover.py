@@ -3,11 +3,11 @@ from itertools import combinations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_problems import problem_of, problems, users
 
-from selection.random_problems import problem_of, problems, users
 from slimsfm.selection import kcover
-from slimsfm.selection.baselines import KCover
 from slimsfm.selection.problem import most_cover
+from slimsfm.selection.selectors import KCover
 
 quick = settings(deadline=None, max_examples=40)
 

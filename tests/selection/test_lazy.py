@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slimsfm.selection import lazy
+from slimsfm.selection import problem as lazy
 
 
 class Coverage:

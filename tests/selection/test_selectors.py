@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_problems import problem_of, problems, reordered, users
 from scipy.sparse import csr_array
 
-from selection.random_problems import problem_of, problems, reordered, users
 from slimsfm.selection import SELECTORS, SelectionProblem
 
 quick = settings(deadline=None, max_examples=40)

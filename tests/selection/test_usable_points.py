@@ -8,8 +8,7 @@ from slimsfm.features import unit_rows
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.map import observed
 from slimsfm.mapping.subset import keep_images
-from slimsfm.selection.leave_one_out import LeftOut
-from slimsfm.selection.usable_points import selection_problem
+from slimsfm.selection.usable_points import LeftOut, selection_problem
 
 
 @pytest.fixture(scope="module")

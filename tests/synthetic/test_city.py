@@ -7,7 +7,7 @@ import pytest
 
 from city import CityOptions, city_map
 from slimsfm.graph import GraphOptions, compute_graph
-from slimsfm.graph.candidates import covisible_pairs
+from slimsfm.graph.edge_sources import covisible_pairs
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import check_map
 

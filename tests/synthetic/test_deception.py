@@ -16,7 +16,7 @@ from deception import (
     twins_query,
 )
 from slimsfm.synthetic.render import Light, Scene, render, visible_meshes
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 AMBIENT = Light(lamp=(0.0, 0.0, 0.0), ambient=(1.0, 1.0, 1.0))
 CENTERED = pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[200, 200, 80, 60])

@@ -7,7 +7,7 @@ import trimesh
 from slimsfm.geometry import project
 from slimsfm.synthetic import shapes
 from slimsfm.synthetic.render import Light, Scene, render, visible_meshes
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at
 
 AMBIENT = Light(lamp=(0.0, 0.0, 0.0), ambient=(1.0, 1.0, 1.0), backdrop=(10.0, 20.0, 30.0))
 PINHOLE = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[300, 305, 163.2, 117.9])

@@ -3,7 +3,7 @@ import pycolmap
 import pytest
 
 from slimsfm.geometry import project
-from slimsfm.synthetic.trajectory import look_at, mapping_path, query_path
+from slimsfm.synthetic.scene import look_at, mapping_path, query_path
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[600, 600, 324, 237])
 

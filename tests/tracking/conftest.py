@@ -6,8 +6,7 @@ import pytest
 
 from rendered import MAPPING_FRAMES, NAME, Rendered, rendered
 from slimsfm.localization import Localizer
-from slimsfm.synthetic.scene import mapping_take
-from slimsfm.synthetic.trajectory import look_at
+from slimsfm.synthetic.scene import look_at, mapping_take
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import pytest
 
 from scenes import BOX, camera, poses
 from slimsfm.geometry import project
-from slimsfm.tracking.relocalization import is_ambiguous
+from slimsfm.tracking.background import is_ambiguous
 
 CAMERA = camera("PINHOLE")
 

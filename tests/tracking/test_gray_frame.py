@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pictures import cloth, grid, moved
-from slimsfm.tracking.gray_frame import follow_points
+from slimsfm.tracking.templates import follow_points
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, -0.7), (5.3, 2.6), (-14.0, 9.5)], ids=str)

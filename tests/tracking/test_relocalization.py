@@ -7,7 +7,7 @@ from scenes import camera, poses
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking import Tracker, TrackerOptions
-from slimsfm.tracking.relocalization import Relocalizer
+from slimsfm.tracking.background import Relocalizer
 
 BLACK = np.zeros((480, 640, 3), np.uint8)
 CAMERA = camera()

@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 
 from pictures import cloth, grid
 from slimsfm.geometry import project
-from slimsfm.tracking.gray_frame import GrayFrame
-from slimsfm.tracking.templates import cut_templates, find_templates, join_templates, spread_over_cells
+from slimsfm.tracking.templates import (
+    GrayFrame,
+    cut_templates,
+    find_templates,
+    join_templates,
+    spread_over_cells,
+)
 
 CAMERA = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[300.0, 300.0, 160.0, 120.0])
 DISTANCE = 3.0

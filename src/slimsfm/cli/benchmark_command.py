@@ -4,11 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.execution import Execution, resumable
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Execution, Networks, resumable
 from slimsfm.cli.options import Advanced, Argument, OutputPath, Positional, Prefixed, Typed
 from slimsfm.cli.output import Stopwatch, console, finish, plural
-from slimsfm.cli.results import print_comparisons, print_summary
+from slimsfm.cli.tables import print_comparisons, print_summary
 from slimsfm.datasets.base import Dataset
 from slimsfm.errors import InputError
 from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
 from slimsfm.mapping.build import BuildOptions, build_map

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from slimsfm.cli.options import Flags
 from slimsfm.cli.output import Stopwatch, console, finish
-from slimsfm.cli.results import print_summary
+from slimsfm.cli.tables import print_summary
 from slimsfm.datasets.synthetic import SynthesisOptions, Synthetic, synthesize
 from slimsfm.errors import OutputError
 from slimsfm.evaluation.benchmark import BenchmarkSetup

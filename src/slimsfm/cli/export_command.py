@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural, size
 from slimsfm.errors import OutputError

@@ -4,10 +4,10 @@ import json as json_format
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.choices import frontier_to_json, kept_graph, print_frontier, promise, read_reducible
-from slimsfm.cli.execution import Execution
+from slimsfm.cli.arguments import Execution
 from slimsfm.cli.options import Advanced, MapPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
+from slimsfm.cli.tables import frontier_to_json, kept_graph, print_frontier, promise, read_reducible
 from slimsfm.files import replacing
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown

@@ -6,15 +6,14 @@ from typing import Annotated
 
 import numpy as np
 
-from slimsfm.cli.execution import Execution, resumable
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Execution, Networks, resumable
 from slimsfm.cli.options import Advanced, Flags, MapPath
 from slimsfm.cli.output import Stopwatch, console, finish
 from slimsfm.files import check_writable, replacing
 from slimsfm.graph import GraphOptions, GraphRun
 from slimsfm.graph.compute import estimate_recall, load_or_compute_graph
+from slimsfm.graph.edge_sources import resolve_edges
 from slimsfm.graph.io import write_graph
-from slimsfm.graph.options import resolve_edges
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import shown
 

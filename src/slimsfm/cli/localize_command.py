@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError

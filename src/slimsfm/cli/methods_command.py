@@ -6,7 +6,7 @@ from typing import Annotated
 
 from rich.table import Table
 
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced
 from slimsfm.cli.output import console
 from slimsfm.errors import InputError

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from slimsfm.cli.choices import kept_graph, print_change, print_dominating_set, promise, read_reducible
-from slimsfm.cli.execution import Execution
+from slimsfm.cli.arguments import Execution, LimitArguments
 from slimsfm.cli.options import Advanced, Flags, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
-from slimsfm.cli.units import LimitArguments
+from slimsfm.cli.tables import kept_graph, print_change, print_dominating_set, promise, read_reducible
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
 from slimsfm.reduction import ImageOptions, ReduceOptions

@@ -7,7 +7,7 @@ from typing import Annotated
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError
@@ -15,7 +15,7 @@ from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
 from slimsfm.mapping.io import read_map
-from slimsfm.report.tracked_video import track_video
+from slimsfm.report.frames import track_video
 from slimsfm.tracking import Tracked, TrackerOptions
 from slimsfm.tracking.video import FrameSource, VideoFrame, check_format
 

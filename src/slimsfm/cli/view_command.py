@@ -4,7 +4,7 @@ from pathlib import Path
 from time import sleep
 from typing import Annotated
 
-from slimsfm.cli.networks import Networks
+from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, MapPath
 from slimsfm.cli.output import console
 from slimsfm.errors import InputError

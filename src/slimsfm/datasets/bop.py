@@ -30,8 +30,14 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
-from slimsfm.datasets.base import LoadOptions, ObjectSequences, PosedSequence
-from slimsfm.datasets.object_model import MILLIMETER, ListedModel, read_object_model
+from slimsfm.datasets.base import (
+    MILLIMETER,
+    ListedModel,
+    LoadOptions,
+    ObjectSequences,
+    PosedSequence,
+    read_object_model,
+)
 from slimsfm.datasets.reading import (
     check_frame_step,
     check_object_name,

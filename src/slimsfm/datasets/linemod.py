@@ -24,8 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slimsfm.datasets.base import LoadOptions, ObjectSequences, PosedSequence
-from slimsfm.datasets.object_model import ListedModel, read_object_model
+from slimsfm.datasets.base import ListedModel, LoadOptions, ObjectSequences, PosedSequence, read_object_model
 from slimsfm.datasets.reading import (
     check_object_name,
     check_paired,

@@ -46,8 +46,14 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
-from slimsfm.datasets.base import LoadOptions, ObjectModel, ObjectSequences, PosedSequence
-from slimsfm.datasets.object_model import check_size, read_object_model
+from slimsfm.datasets.base import (
+    LoadOptions,
+    ObjectModel,
+    ObjectSequences,
+    PosedSequence,
+    check_size,
+    read_object_model,
+)
 from slimsfm.datasets.reading import (
     PIXEL_CENTER,
     check_frame_step,
@@ -64,7 +70,7 @@ from slimsfm.datasets.reading import (
 )
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box
-from slimsfm.mapping.box import read_box
+from slimsfm.mapping.model import read_box
 
 FrameKind = Literal["full", "cropped"]
 """Which images of a sequence to read."""

@@ -1,11 +1,8 @@
 """Minimum dominating sets of directed graphs: pure graph theory, independent of images."""
 
 from slimsfm.domination.exact_solvers import cpsat, exact
-from slimsfm.domination.greedy_cover import cover_order, greedy
-from slimsfm.domination.problem import DominationProblem, dominates
-from slimsfm.domination.random_draws import random_greedy
-from slimsfm.domination.solution import Solution, Solver
-from slimsfm.domination.validation import Adjacency
+from slimsfm.domination.greedy_cover import cover_order, greedy, random_greedy
+from slimsfm.domination.problem import Adjacency, DominationProblem, Solution, Solver, dominates
 
 SOLVERS: dict[str, Solver] = {
     "cpsat": cpsat,

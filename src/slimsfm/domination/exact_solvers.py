@@ -5,10 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import Bounds, milp
 
-from slimsfm.domination.lexicographic import solve_in_stages
-from slimsfm.domination.milp import Minimum, Program
-from slimsfm.domination.problem import DominationProblem
-from slimsfm.domination.solution import Solution
+from slimsfm.domination.lexicographic import Minimum, Program, solve_in_stages
+from slimsfm.domination.problem import DominationProblem, Solution
 from slimsfm.errors import InputError
 
 if TYPE_CHECKING:

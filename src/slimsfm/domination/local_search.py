@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slimsfm.domination.cover import Columns, Cover, Rows
-from slimsfm.domination.problem import DominationProblem
-from slimsfm.domination.solution import merit
+from slimsfm.domination.problem import DominationProblem, merit
 
 
 @dataclass(kw_only=True, eq=False)

@@ -6,13 +6,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slimsfm.datasets.base import LoadOptions, ObjectSequences, map_object
-from slimsfm.evaluation.protocol import PreparedQuery, evaluate, prepare_queries, queries_of
-from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, map_path
+from slimsfm.evaluation.results import (
+    MappedObject,
+    MapRun,
+    Measurement,
+    ObjectResult,
+    PreparedQuery,
+    evaluate,
+    map_path,
+    prepare_queries,
+    queries_of,
+)
 from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
 from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
-from slimsfm.graph.options import Edges
+from slimsfm.graph.edge_sources import Edges
 from slimsfm.localization import LocalizationOptions
 from slimsfm.localization.localizer import supports
 from slimsfm.mapping.build import BuildOptions

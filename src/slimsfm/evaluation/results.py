@@ -1,15 +1,25 @@
 """What a benchmark measures: outcomes of queries, maps of each object, one measurement per table row."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
+from scipy.spatial import KDTree
 
-from slimsfm.geometry import Box
+from slimsfm.arrays import Points3D
+from slimsfm.datasets.base import ObjectModel, PosedSequence
+from slimsfm.features import Features, load_extractor
+from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_error
+from slimsfm.localization import Localization, LocalizationOptions, Localizer
+from slimsfm.localization.strategy import MatchingOptions
+from slimsfm.mapping.map import Map
+from slimsfm.photos import read_image
+from slimsfm.progress import ProgressBar, silent
 
 STAGES = ("extract", "match", "pose")
 """Stages of localizing a query, in this order."""
@@ -220,3 +230,191 @@ def map_path(folder: Path, name: str, method: str, variant: str) -> Path:
 def maps_path(folder: Path, name: str) -> Path:
     """Folder of all maps of an object, inside the folder of a run."""
     return folder / "maps" / name
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseError:
+    """Difference between an estimated and the true pose; infinite without a pose."""
+
+    relative: float
+    """Mean distance of the corners of the box under the two poses, divided by its diagonal. If the data set
+    has a model of the object: mean distance of its vertices, divided by its diameter."""
+
+    rotation_deg: float
+    """Angle between the two rotations, in [0, 180]."""
+
+    translation: float
+    """Distance between the two positions of the world origin in the camera frame, in map units."""
+
+
+NO_POSE = PoseError(relative=np.inf, rotation_deg=np.inf, translation=np.inf)
+"""Error of a query without a pose."""
+
+
+def pose_error(
+    estimated_cam_from_world: pycolmap.Rigid3d | None,
+    true_cam_from_world: pycolmap.Rigid3d,
+    box: Box,
+    model: ObjectModel | None = None,
+) -> PoseError:
+    """Compare an estimated pose with the true pose.
+
+    Args:
+        estimated_cam_from_world: The estimate, or None if there is no pose.
+        true_cam_from_world: The true pose.
+        box: Box of the object. Its corners define the error, as in the paper.
+        model: Model of the object, if the data set has one. Its vertices then define the error [1]; for a
+            symmetric object, each vertex counts with its distance to the nearest one.
+
+    References:
+        [1] Hinterstoisser et al., Model Based Training, Detection and Pose Estimation of Texture-less 3D
+            Objects in Heavily Cluttered Scenes, ACCV 2012: ADD, and ADD-S for symmetric objects.
+    """
+    if estimated_cam_from_world is None:
+        return NO_POSE
+    if model is None:
+        relative = corner_error(estimated_cam_from_world, true_cam_from_world, box)
+    else:
+        relative = model_error(estimated_cam_from_world, true_cam_from_world, model)
+    return PoseError(
+        relative=relative,
+        rotation_deg=rotation_error_deg(estimated_cam_from_world, true_cam_from_world),
+        translation=translation_error(estimated_cam_from_world, true_cam_from_world),
+    )
+
+
+def model_error(
+    estimated_cam_from_world: pycolmap.Rigid3d, true_cam_from_world: pycolmap.Rigid3d, model: ObjectModel
+) -> float:
+    """ADD, or ADD-S if the object is symmetric: mean distance of the vertices, divided by the diameter."""
+    estimated, true = (pose * model.vertices for pose in (estimated_cam_from_world, true_cam_from_world))
+    return float(_distances(estimated, true, nearest=model.symmetric).mean() / model.diameter)
+
+
+def _distances(estimated: Points3D, true: Points3D, *, nearest: bool) -> Float64[np.ndarray, " n"]:
+    """From each true vertex to the estimated one, or to the nearest estimated one."""
+    if nearest:
+        return np.asarray(KDTree(estimated).query(true)[0], np.float64)
+    return np.linalg.norm(estimated - true, axis=1)
+
+
+def outcomes_of(
+    found: Sequence[Localization],
+    truth: Sequence[pycolmap.Rigid3d],
+    box: Box,
+    model: ObjectModel | None = None,
+) -> Outcomes:
+    """Compare localization results with the true poses.
+
+    Args:
+        found: Localization result of each query.
+        truth: True pose of each query.
+        box: Box of the object.
+        model: Model of the object, if the data set has one.
+
+    Raises:
+        ValueError: `found` is empty, or `found` and `truth` differ in length.
+    """
+    if not found:
+        raise ValueError("found must hold at least one query")
+    poses = tuple(one.pose and one.pose.cam_from_world for one in found)
+    errors = [pose_error(pose, true, box, model) for pose, true in zip(poses, truth, strict=True)]
+    confidence = [one.pose.confidence if one.pose else None for one in found]
+    return Outcomes(
+        error=np.array([one.relative for one in errors]),
+        rotation_deg=np.array([one.rotation_deg for one in errors]),
+        translation=np.array([one.translation for one in errors]),
+        confidence=np.array([np.nan if one is None else one for one in confidence], np.float64),
+        references=np.array([one.references for one in found], np.int64),
+        seconds=np.array([[getattr(one.seconds, stage) for stage in STAGES] for one in found], np.float64),
+        cam_from_world=poses,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedQuery:
+    """A query with extracted features, which all variants and strategies share."""
+
+    query: PosedQuery
+    """The image and its true pose."""
+
+    features: Features
+    """Features from the extractor of the map."""
+
+    extract_seconds: float
+    """Extraction time."""
+
+
+def queries_of(sequence: PosedSequence) -> list[PosedQuery]:
+    """The frames of a sequence as queries."""
+    return [
+        PosedQuery(path=path, camera=camera, cam_from_world=pose)
+        for path, camera, pose in zip(
+            sequence.image_paths, sequence.cameras, sequence.cam_from_world, strict=True
+        )
+    ]
+
+
+def prepare_queries(
+    map: Map, queries: Sequence[PosedQuery], progress: ProgressBar = silent
+) -> list[PreparedQuery]:
+    """Extract the features of queries with the extractor of the map."""
+    extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+    prepared = []
+    for query in progress(queries, "extract query features"):
+        image = read_image(query.path)
+        start = perf_counter()
+        features = extractor.extract(image)
+        seconds = perf_counter() - start
+        prepared.append(PreparedQuery(query=query, features=features, extract_seconds=seconds))
+    return prepared
+
+
+def localize_all(
+    map: Map,
+    queries: Sequence[PreparedQuery],
+    strategy: str,
+    matcher: str = "auto",
+    progress: ProgressBar = silent,
+) -> list[Localization]:
+    """Localize queries one after the other.
+
+    The first query runs once more before, without timing, to fill caches.
+
+    Raises:
+        ValueError: `queries` is empty.
+    """
+    if not queries:
+        raise ValueError("queries must hold at least one query")
+    options = LocalizationOptions(strategy=strategy, matching=MatchingOptions(matcher=matcher))
+    localizer = Localizer(map, options)
+    _localize(localizer, queries[0])
+    return [_localize(localizer, query) for query in progress(queries, f"localize queries ({strategy})")]
+
+
+def evaluate(
+    map: Map,
+    queries: Sequence[PreparedQuery],
+    strategy: str,
+    matcher: str = "auto",
+    progress: ProgressBar = silent,
+    model: ObjectModel | None = None,
+) -> Outcomes:
+    """Localize queries against a map and compare the poses with the true ones.
+
+    Args:
+        map: The map.
+        queries: The queries with their features.
+        strategy: How queries are matched.
+        matcher: Name of the matcher.
+        progress: Progress callback, called once per query.
+        model: Model of the object, if the data set has one.
+    """
+    found = localize_all(map, queries, strategy, matcher, progress)
+    return outcomes_of(found, [one.query.cam_from_world for one in queries], map.box, model)
+
+
+def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
+    image = read_image(prepared.query.path) if localizer.looks_at_images else None
+    found = localizer.localize_features(prepared.features, prepared.query.camera, image=image)
+    return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))

@@ -25,8 +25,7 @@ from slimsfm.reduction import (
     recommend,
 )
 from slimsfm.selection import SELECTORS, current_selector
-from slimsfm.selection.leave_one_out import LeftOut
-from slimsfm.selection.usable_points import selection_problem
+from slimsfm.selection.usable_points import LeftOut, selection_problem
 
 _DRAWS = 5
 _SELECTOR = "information"

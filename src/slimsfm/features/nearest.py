@@ -1,9 +1,12 @@
 """Matching by descriptor distance: mutual nearest neighbors that pass Lowe's ratio test."""
 
+import warnings
+
 import numpy as np
 from jaxtyping import Float32, Int64
+from scipy.sparse import csr_array
 
-from slimsfm.arrays import IndexPairs
+from slimsfm.arrays import Descriptors, IndexPairs
 from slimsfm.features.base import Features, NearestOptions, unit_rows
 from slimsfm.features.registry import descriptor_metric_of
 
@@ -71,3 +74,49 @@ def _nearest_two(
 
 def _angles(cosines: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
     return np.arccos(np.clip(cosines, -1, 1))
+
+
+NUM_WORDS = 64
+_SAMPLE = 20_000  # descriptors from which words are learned
+_ROUNDS = 8  # of k-means
+
+
+def learn_words(descriptors: Descriptors, seed: int = 0) -> Float32[np.ndarray, "words d"]:
+    """Cluster descriptors into 64 words by k-means, or fewer if there are fewer descriptors.
+
+    Raises:
+        ValueError: `descriptors` is empty.
+    """
+    from scipy.cluster.vq import kmeans2  # slow to import, and only needed here
+
+    if not len(descriptors):
+        raise ValueError("descriptors must have at least one row to learn words from")
+    rng = np.random.default_rng(seed)
+    if len(descriptors) > _SAMPLE:
+        descriptors = descriptors[np.sort(rng.choice(len(descriptors), _SAMPLE, replace=False))]
+    count = min(NUM_WORDS, len(descriptors))
+    first = descriptors[np.sort(rng.choice(len(descriptors), count, replace=False))]
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # an empty word keeps its position
+        words, _ = kmeans2(descriptors, first, iter=_ROUNDS, minit="matrix", missing="warn")
+    return np.ascontiguousarray(words, np.float32)
+
+
+def nearest_word(descriptors: Descriptors, words: Float32[np.ndarray, "words d"]) -> Int64[np.ndarray, " n"]:
+    """Row of the nearest word of each descriptor."""
+    return np.argmax(descriptors @ words.T - 0.5 * np.einsum("wd,wd->w", words, words), axis=1)
+
+
+def vlad(descriptors: Descriptors, words: Float32[np.ndarray, "words d"]) -> Float32[np.ndarray, " words*d"]:
+    """Aggregate the descriptors of an image into one vector of unit length; zeros if there are none.
+
+    Per word, the differences of its descriptors from it are summed and scaled to unit length, so that
+    repeated texture does not count more. O(n words d).
+    """
+    count = len(descriptors)
+    nearest = nearest_word(descriptors, words)
+    order = np.argsort(nearest, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(nearest, minlength=len(words)))])
+    members = csr_array((np.ones(count, np.float32), order, starts), shape=(len(words), count))
+    sums = members @ descriptors - np.diff(starts).astype(np.float32)[:, None] * words
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.float32(1e-6))
+    return sums.ravel() / max(np.linalg.norm(sums), np.float32(1e-6))

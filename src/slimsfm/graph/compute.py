@@ -13,16 +13,16 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.execution import OpenExecutor, run_tasks
 from slimsfm.files import remove
-from slimsfm.graph.candidates import all_pairs
-from slimsfm.graph.io import Checkpoint, read_kept_graph, write_graph
-from slimsfm.graph.options import (
+from slimsfm.graph.edge_sources import (
     EdgeSource,
     GraphOptions,
     PairIndices,
+    all_pairs,
     edge_source,
     graph_key,
     resolve_edges,
 )
+from slimsfm.graph.io import Checkpoint, read_kept_graph, write_graph
 from slimsfm.graph.reference_graph import GraphRun, ReferenceGraph
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map, check_has_features

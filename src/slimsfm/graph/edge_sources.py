@@ -4,20 +4,188 @@ References:
     [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set, 2025.
 """
 
+import hashlib
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from importlib import import_module
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Float32, Int64
+from scipy.sparse import triu
 
 from slimsfm.arrays import Ids, Points2D
+from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
-from slimsfm.geometry import corner_error
-from slimsfm.graph.candidates import all_pairs, covisible_pairs, likely_pairs
-from slimsfm.graph.options import GraphOptions, PairErrors, PairIndices
+from slimsfm.geometry import corner_error, project
 from slimsfm.localization.matching import matching_with
 from slimsfm.localization.strategy import MatchingOptions, Query
-from slimsfm.mapping.map import Map
+from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import RansacOptions, estimate_pose
+
+Edges = Literal["auto", "matches", "tracks", "localize", "hybrid"]
+
+PairIndices = Int64[np.ndarray, "k 2"]
+"""Rows (u, v), u < v: indices of two reference images in the order of their names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphOptions:
+    """How to decide whether one reference image localizes another."""
+
+    edges: Edges = "auto"
+    """matches: use the verified matches in the map. tracks: use only the points that both images see.
+    localize: match each image against each other image again (the paper's Algorithm 1). hybrid: use the
+    matches, and localize where they do not decide. auto: matches, or tracks if the map has no matches."""
+
+    candidates: Literal["likely", "all"] = "likely"
+    """Pairs that `localize` tries. likely: pairs that see a common point, or overlapping parts of the box
+    from similar directions. all: every pair."""
+
+    threshold: float = 0.05
+    """Relative corner error below which an image counts as localized; `hybrid` localizes pairs near it."""
+
+    matcher: str = "auto"
+    """Matcher for pairs that are matched again. auto: nearest neighbors, or the map's own matcher if it was
+    built without a detector."""
+
+    ransac: RansacOptions = RansacOptions()
+    """The robust pose search."""
+
+    def __post_init__(self) -> None:
+        if self.edges not in get_args(Edges):
+            raise ValueError(f"edges must be one of {', '.join(get_args(Edges))}, got {self.edges!r}")
+        if not self.threshold > 0:
+            raise ValueError(f"threshold must be positive, got {self.threshold}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairErrors:
+    """Relative corner errors of images u and v localized from each other; infinite without a pose."""
+
+    v_from_u: float
+    """Error of v's pose, estimated from u alone."""
+
+    u_from_v: float
+    """Error of u's pose, estimated from v alone."""
+
+
+@runtime_checkable
+class EdgeSource(Protocol):
+    """Localizes two reference images of one map from each other. Equal pairs have equal errors."""
+
+    def pairs(self) -> PairIndices:
+        """Return the pairs to try, in lexicographic order; all other pairs have no edge."""
+        ...
+
+    def errors(self, u: int, v: int) -> PairErrors:
+        """Localize two images from each other, given by their indices in the order of names."""
+        ...
+
+
+# Paths, not classes: naming a source must not import what it needs.
+EDGE_SOURCES = {
+    "hybrid": "slimsfm.graph.edge_sources:HybridEdges",
+    "localize": "slimsfm.graph.edge_sources:LocalizeEdges",
+    "matches": "slimsfm.graph.edge_sources:MatchEdges",
+    "tracks": "slimsfm.graph.edge_sources:TrackEdges",
+}
+
+
+def edge_source(map: Map, options: GraphOptions) -> EdgeSource:
+    """Create the edge source that the options select."""
+    module, attribute = EDGE_SOURCES[resolve_edges(map, options)].split(":")
+    return getattr(import_module(module), attribute)(map, options)
+
+
+def resolve_edges(map: Map, options: GraphOptions) -> str:
+    """Return the name of the edge source that the options select; "auto" depends on the map.
+
+    Raises:
+        InputError: `options.edges` is "matches" and the map has no matches.
+    """
+    if options.edges == "matches" and not map.matches:
+        raise InputError("the map has no matches; use `edges='tracks'` or `edges='localize'`")
+    if options.edges != "auto":
+        return options.edges
+    return "matches" if map.matches else "tracks"
+
+
+def graph_key(map: Map, options: GraphOptions) -> str:
+    """Hash everything that a reference graph depends on: graphs and checkpoints of equal work share a key."""
+    return hashlib.sha256(f"{_relevant(map, options)} {map.fingerprint}".encode()).hexdigest()
+
+
+def _relevant(map: Map, options: GraphOptions) -> GraphOptions:
+    """The options, with defaults for those that the selected source ignores."""
+    edges, default = resolve_edges(map, options), GraphOptions()
+    return replace(
+        options,
+        edges=edges,
+        threshold=options.threshold if edges == "hybrid" else default.threshold,
+        candidates=options.candidates if edges == "localize" else default.candidates,
+        matcher=options.matcher if edges in ("localize", "hybrid") else default.matcher,
+    )
+
+
+_GRID = 5  # samples along each edge of the box
+_MAX_ANGLE_DEG = 75.0  # between viewing directions: no built-in extractor matches across more
+_BLOCK = 1024  # images compared at once
+
+
+def covisible_pairs(map: Map, min_points: int = 1) -> Int64[np.ndarray, "k 2"]:
+    """Pairs (u, v), u < v, that see at least `min_points` common points; O(sum of squared track lengths)."""
+    incidence = observed(map).astype(np.int32)
+    common = triu(incidence @ incidence.T, k=1).tocoo()
+    enough = common.data >= min_points
+    return _sorted(np.stack([common.row[enough], common.col[enough]], axis=1).astype(np.int64))
+
+
+def likely_pairs(map: Map) -> Int64[np.ndarray, "k 2"]:
+    """Pairs that see a common point, or overlapping parts of the box from directions within 75 degrees.
+
+    The box is sampled on a 5 x 5 x 5 grid. The direction of an image points from its camera to the mean of
+    the samples it sees.
+    """
+    visible, directions = _views(map)
+    least_cosine = np.cos(np.radians(_MAX_ANGLE_DEG))
+    found = [covisible_pairs(map)]
+    for start in range(0, len(visible), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        meet = (visible[block] @ visible.T > 0) & (directions[block] @ directions.T >= least_cosine)
+        rows, columns = np.nonzero(meet)
+        found.append(np.stack([rows + start, columns], axis=1)[columns > rows + start])
+    return _sorted(np.concatenate(found))
+
+
+def all_pairs(map: Map) -> Int64[np.ndarray, "k 2"]:
+    """All pairs (u, v), u < v."""
+    return np.stack(np.triu_indices(len(map.images), k=1), axis=1).astype(np.int64)
+
+
+def _views(map: Map) -> tuple[Float32[np.ndarray, "n s"], Float32[np.ndarray, "n 3"]]:
+    """Which samples of the box each image sees, as 0 and 1, and its direction toward them (0 if none)."""
+    steps = np.linspace(-1, 1, _GRID)
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    samples = map.box.center + grid @ map.box.half_edges
+    visible = np.array([_inside(map, name, samples) for name in map.images])
+    directions = np.zeros((len(visible), 3), np.float32)
+    for row, image in enumerate(map.images.values()):
+        if visible[row].any():
+            towards = samples[visible[row]].mean(axis=0) - image.projection_center()
+            directions[row] = towards / max(float(np.linalg.norm(towards)), 1e-12)
+    return visible.astype(np.float32), directions
+
+
+def _inside(map: Map, name: str, samples: np.ndarray) -> Bool[np.ndarray, " s"]:
+    camera = map.camera(name)
+    pixels = project(samples, map.images[name].cam_from_world(), camera)
+    return np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=1)
+
+
+def _sorted(pairs: Int64[np.ndarray, "k 2"]) -> Int64[np.ndarray, "_ 2"]:
+    return np.unique(pairs, axis=0)
+
 
 _CACHED_IMAGES = 256
 _CACHED_QUERIES = 64  # 2 MB each with 4096 descriptors of 128 numbers

@@ -1,19 +1,75 @@
 """Localize all images of a folder, on several threads."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import NamedTuple
 
 import pycolmap
 
+from slimsfm.arrays import Image
 from slimsfm.execution import map_on_threads, num_cores
+from slimsfm.features import Features
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.localization.multi import MultiLocalizer
 from slimsfm.photos import list_images, read_image
-from slimsfm.pose.priors import Gravity
+from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
+
+
+class MultiLocalizer:
+    """Localizes images against several maps; extracts features once for maps with the same extractor.
+
+    Attributes:
+        localizers: The localizer of each object's map, by name of the object.
+    """
+
+    def __init__(self, localizers: Mapping[str, Localizer]) -> None:
+        """Take a localizer for each object, by name of the object.
+
+        Raises:
+            ValueError: `localizers` is empty.
+        """
+        if not localizers:
+            raise ValueError("localizers must hold at least one")
+        self.localizers = dict(localizers)
+
+    def localize(
+        self,
+        image: Image,
+        cameras: Mapping[str, pycolmap.Camera | None] | None = None,
+        gravity: Gravity | None = None,
+    ) -> dict[str, Localization]:
+        """Search one image for every object.
+
+        Args:
+            image: Upright RGB.
+            cameras: Intrinsics by name of the object; where they are missing or None, those of the object's
+                map are used.
+            gravity: As in `Localizer.localize`; all maps must share one frame.
+
+        Returns:
+            The outcome by name of the object, in the order of the localizers. The image shows the objects
+            that have a pose. The time of a shared extraction counts for the first object only.
+
+        Raises:
+            ValueError: As in `Localizer.localize`.
+        """
+        extracted: dict[str, Features] = {}
+        found = {}
+        for name, localizer in self.localizers.items():
+            camera = localizer.camera_of(image, (cameras or {}).get(name))
+            info, start = localizer.map.info, perf_counter()
+            key = repr((info.extractor, sorted(info.extractor_options.items())))
+            if key not in extracted:
+                extracted[key] = localizer.extractor.extract(image)
+            seconds = perf_counter() - start
+            one = localizer.localize_features(extracted[key], camera, gravity)
+            found[name] = replace(one, seconds=replace(one.seconds, extract=seconds))
+        return found
+
 
 _ONLY = ""  # name of the object where there is one map
 

@@ -11,7 +11,7 @@ from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
-from slimsfm.localization.guided_matching import extract_near
+from slimsfm.localization.matching import extract_near
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.map import Map
@@ -19,12 +19,12 @@ from slimsfm.pose import Gravity, PoseEstimate, RansacOptions
 
 # Paths, not classes: naming a strategy must not import its dependencies.
 STRATEGIES = {
-    "direct": "slimsfm.localization.direct:Direct",
-    "exhaustive": "slimsfm.localization.reference_images:Exhaustive",
+    "direct": "slimsfm.localization.strategies:Direct",
+    "exhaustive": "slimsfm.localization.strategies:Exhaustive",
     "onepose": "slimsfm.methods.onepose.strategy:OnePoseStrategy",
     "onepose++": "slimsfm.methods.onepose_plus.strategy:OnePosePlusStrategy",
-    "progressive": "slimsfm.localization.progressive:Progressive",
-    "retrieval": "slimsfm.localization.reference_images:Retrieval",
+    "progressive": "slimsfm.localization.strategies:Progressive",
+    "retrieval": "slimsfm.localization.strategies:Retrieval",
 }
 
 

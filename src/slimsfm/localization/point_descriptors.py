@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from slimsfm.arrays import Descriptors, Mask
 from slimsfm.features import unit_rows
-from slimsfm.features.vlad import learn_words, nearest_word
+from slimsfm.features.nearest import learn_words, nearest_word
 from slimsfm.mapping.map import Map, PointDescriptors
 
 _ALIKE = 0.5  # of the largest angle between matching descriptors: points look alike

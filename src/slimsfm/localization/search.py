@@ -9,7 +9,7 @@ import pycolmap
 
 from slimsfm.geometry import project
 from slimsfm.localization.cameras import FocalLength
-from slimsfm.localization.guided_matching import match_near
+from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier

@@ -14,10 +14,10 @@ from slimsfm.errors import InputError
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
-from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.sfm import (
     colmap_warnings,

@@ -18,7 +18,7 @@ from jaxtyping import Float32, UInt8
 from slimsfm.arrays import Descriptors, Mask
 from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
-from slimsfm.features.vlad import learn_words, vlad
+from slimsfm.features.nearest import learn_words, vlad
 from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors
 
 _LEVELS = 15

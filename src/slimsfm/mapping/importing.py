@@ -12,11 +12,10 @@ from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
-from slimsfm.mapping.box import estimate_box, read_box
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import redescribe
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.model import camera_of, read_model
+from slimsfm.mapping.model import camera_of, estimate_box, read_box, read_model
 from slimsfm.mapping.sfm import colmap_warnings, verified_matches
 from slimsfm.progress import ProgressBar, silent
 

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.features import Features, Matcher, unit_rows
-from slimsfm.features.vlad import learn_words, vlad
+from slimsfm.features.nearest import learn_words, vlad
 from slimsfm.progress import ProgressBar, silent, single_step
 
 Pairs = list[tuple[str, str]]

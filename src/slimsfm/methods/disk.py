@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
 from slimsfm.methods.tensors import check_sizes, features_of, network_input
-from slimsfm.networks.devices import choose_device, inference
-from slimsfm.networks.loading import load_network
+from slimsfm.networks.loading import choose_device, inference, load_network
 from slimsfm.networks.onnx import Exportable, onnx_run
 
 _STEP = 16  # pixels: the sides of the network's input must be multiples of it

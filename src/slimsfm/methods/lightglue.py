@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features.base import Features, unit_rows
-from slimsfm.networks.devices import choose_device, inference
-from slimsfm.networks.loading import load_network
+from slimsfm.networks.loading import choose_device, inference, load_network
 from slimsfm.networks.onnx import Exportable, onnx_run
 
 KNOWN = ("aliked", "disk", "sift", "superpoint")

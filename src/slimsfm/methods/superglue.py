@@ -20,8 +20,7 @@ from transformers.models.superglue.modeling_superglue import log_optimal_transpo
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.features.base import Features, unit_rows
-from slimsfm.networks.devices import choose_device, inference
-from slimsfm.networks.loading import load_network
+from slimsfm.networks.loading import choose_device, inference, load_network
 
 _THRESHOLD = 0.2  # least probability of a match
 _ITERATIONS = 100  # of Sinkhorn's algorithm

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from slimsfm.errors import InputError
-from slimsfm.networks.devices import choose_device
+from slimsfm.networks.loading import choose_device
 from slimsfm.weights import WEIGHTS, current_runtime, find_weights, remind_of_license
 
 Run = Callable[..., tuple[Tensor, ...]]

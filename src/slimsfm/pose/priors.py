@@ -9,12 +9,21 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.geometry import motions
-from slimsfm.pose.pinhole import check_has_focal_length
 
 _USUAL = 1.2  # focal length over the longer side, as COLMAP guesses
 _TRIED = (0.23, 5.3)  # over the longer side: fields of view of 130 to 11 degrees
 _POSSIBLE = (0.1, 10.0)  # over the longer side: COLMAP also rejects photographs beyond these
 _STRIDE = 1.43  # ratio of successive focal lengths to try; an error of a fifth leaves a third of the inliers
+
+
+def check_has_focal_length(camera: pycolmap.Camera) -> None:
+    """Check that the camera is not spherical.
+
+    Raises:
+        ValueError: The camera is spherical and has no focal length, which a pinhole solver needs.
+    """
+    if camera.is_spherical():
+        raise ValueError(f"camera must have a focal length, got the spherical model {camera.model_name}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

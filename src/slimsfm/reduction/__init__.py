@@ -1,6 +1,14 @@
 """Reduction of a map: choose images or points to keep, and predict what that costs."""
 
-from slimsfm.reduction.choice import Candidate, Choice, Frontier, apply_choice, points_seen
+from slimsfm.reduction.choice import (
+    Candidate,
+    Choice,
+    Frontier,
+    ReductionLimits,
+    apply_choice,
+    points_seen,
+    recommend,
+)
 from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.image_sets import (
     DominatingSetOptions,
@@ -9,7 +17,6 @@ from slimsfm.reduction.image_sets import (
     images_within,
     keep_random_images,
 )
-from slimsfm.reduction.limits import ReductionLimits, recommend
 from slimsfm.reduction.pareto import USES, FrontierOptions, GraphProvider, forecast_images, frontier
 from slimsfm.reduction.reduced import ImageOptions, Reduced, ReduceOptions, reduce
 

@@ -1,11 +1,13 @@
 """One way to make a map small: what it keeps, its size, and how it is predicted to localize."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 
 from slimsfm.arrays import Ids
+from slimsfm.errors import InputError
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.map import Map, PointDescriptors
@@ -106,3 +108,138 @@ def apply_choice(map: Map, choice: Choice, *, described: PointDescriptors | None
 def points_seen(map: Map, images: tuple[str, ...]) -> Ids:
     """Rows of the points that some images see, ascending: P' in the paper."""
     return np.unique(np.concatenate([map.observations[name].points for name in images]))
+
+
+_RESERVE = 2.0  # times the points of the smallest candidate that loses nothing
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReductionLimits:
+    """Limits of a reduced map; the smallest candidate within them is taken."""
+
+    max_loss: float | None = None
+    """Largest loss against the full map within each of 0.1, 0.05 and 0.02 d, in percentage points; None: the
+    least possible, with a reserve."""
+
+    max_bytes: float | None = None
+    """Largest size of the map on disk, in bytes."""
+
+    max_ms: float | None = None
+    """Longest time of matching and pose per query on this machine, in milliseconds."""
+
+    max_points: int | None = None
+    """Largest number of points."""
+
+    max_images: int | None = None
+    """Largest number of images, where images are kept."""
+
+    def __post_init__(self) -> None:
+        for name, value in self.given.items():
+            if not value >= 0:
+                raise ValueError(f"{name} must not be negative, got {value}")
+
+    @property
+    def given(self) -> dict[str, int | float]:
+        """The limits that are set, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value:g}" for name, value in self.given.items())
+
+
+def recommend(frontier: Frontier, use: str, limits: ReductionLimits = ReductionLimits()) -> Candidate:
+    """Take the smallest candidate for a use that meets the limits.
+
+    Without `max_loss`, the smallest candidate that loses nothing on the references is replaced by one of the
+    same method with twice as many points, if there is one: queries resemble the references less than these
+    resemble each other. If every candidate loses something, the one that loses least is taken.
+
+    Raises:
+        InputError: No candidate meets the limits.
+    """
+    usable = [one for one in frontier.candidates if _is_usable(one.choice, use) and one.prediction.tests]
+    if not usable:
+        raise InputError(f"there is no way to reduce this map for {use}")
+    fitting = [one for one in usable if _excess(_figures(one), limits) <= 0]
+    if not fitting:
+        nearest = min(usable, key=lambda one: (_excess(_figures(one), limits), _size(one)))
+        raise InputError(
+            f"{_refusal(nearest.choice, nearest.bytes, limits)}, loses {nearest.loss:.1f} points "
+            f"and takes {1e3 * nearest.seconds:.2g} ms"
+        )
+    if limits.max_loss is not None:
+        return min(fitting, key=_size)
+    least = max(min(one.loss for one in fitting), 0.0)
+    smallest = min((one for one in fitting if one.loss <= least), key=_size)
+    return _with_reserve(smallest, fitting)
+
+
+def check_reachable(
+    choices: Sequence[Choice], sizes: Sequence[int], use: str, limits: ReductionLimits
+) -> None:
+    """Refuse limits that no choice can meet, before anything is predicted.
+
+    Args:
+        choices: The choices that would be predicted.
+        sizes: The bytes of their maps.
+        use: "direct" or "images".
+        limits: The limits; those on loss and time are not checked here.
+
+    Raises:
+        InputError: No choice for the use meets the limits; the nearest one is named.
+    """
+    usable = [pair for pair in zip(choices, sizes, strict=True) if _is_usable(pair[0], use)]
+    excesses = [_excess(_weights(*pair), limits) for pair in usable]
+    if usable and min(excesses) > 0:
+        nearest = usable[excesses.index(min(excesses))]
+        raise InputError(_refusal(*nearest, limits))
+
+
+def _is_usable(choice: Choice, use: str) -> bool:
+    """Whether a choice may be taken: the points of a dominating set are only listed for comparison."""
+    return choice.use == use and (use, choice.method) != ("direct", DOMINATING)
+
+
+def _weights(choice: Choice, size: int) -> dict[str, int | float]:
+    return {"max_bytes": size, "max_points": len(choice.points), "max_images": len(choice.images)}
+
+
+def _figures(one: Candidate) -> dict[str, int | float]:
+    return {**_weights(one.choice, one.bytes), "max_loss": one.loss, "max_ms": 1e3 * one.seconds}
+
+
+def _excess(figures: dict[str, int | float], limits: ReductionLimits) -> float:
+    """By how much figures exceed the limits, the worst one counted: 0 or less where all limits are met."""
+    excesses = [0.0]
+    for name, limit in limits.given.items():
+        if figures.get(name, limit) > limit:
+            unit = 1.0 if name == "max_loss" else _TINY
+            excesses.append((figures[name] - limit) / max(limit, unit))
+    return max(excesses)
+
+
+def _size(one: Candidate) -> tuple[int, int, float]:
+    """Fewer images and points first; among equals the more accurate."""
+    return len(one.choice.images), len(one.choice.points), one.prediction.median_error
+
+
+def _with_reserve(smallest: Candidate, fitting: list[Candidate]) -> Candidate:
+    enough = _RESERVE * len(smallest.choice.points)
+    larger = [
+        one
+        for one in fitting
+        if one.choice.method == smallest.choice.method
+        and len(one.choice.points) >= enough
+        and one.choice.use == "direct"
+    ]
+    return min(larger, key=_size, default=smallest)
+
+
+def _refusal(nearest: Choice, size: int, limits: ReductionLimits) -> str:
+    images = f"{len(nearest.images)} images, " if nearest.images else ""
+    return (
+        f"no choice for {nearest.use} meets {limits}; the nearest, {nearest.method} ({nearest.detail}), "
+        f"has {images}{len(nearest.points)} points and {size} bytes"
+    )

@@ -24,7 +24,7 @@ from slimsfm.mapping.descriptors import quantize
 from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.selection.leave_one_out import LeftOut
+from slimsfm.selection.usable_points import LeftOut
 
 _MOST_TESTS = 60
 _LOST = 0.5  # largest share of correct matches that is removed

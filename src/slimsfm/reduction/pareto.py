@@ -7,20 +7,27 @@ import numpy as np
 
 from slimsfm.errors import InputError, MapError
 from slimsfm.graph import GraphOptions, ReferenceGraph, compute_graph
-from slimsfm.graph.options import Edges
+from slimsfm.graph.edge_sources import Edges
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.io import weigh_map
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction.choice import DOMINATING, Candidate, Choice, Frontier, apply_choice, points_seen
+from slimsfm.reduction.choice import (
+    DOMINATING,
+    Candidate,
+    Choice,
+    Frontier,
+    ReductionLimits,
+    apply_choice,
+    check_reachable,
+    points_seen,
+)
 from slimsfm.reduction.forecast import Trials
 from slimsfm.reduction.image_sets import DominatingSetOptions, dominating_set
-from slimsfm.reduction.limits import ReductionLimits, check_reachable
 from slimsfm.selection import REPLACED_SELECTORS, SELECTORS, current_selector
-from slimsfm.selection.leave_one_out import LeftOut
 from slimsfm.selection.problem import SelectionProblem
-from slimsfm.selection.usable_points import selection_problem
+from slimsfm.selection.usable_points import LeftOut, selection_problem
 
 USES = ("direct", "images")
 """How queries can be matched with a reduced map: with its points directly, or with its images."""

@@ -8,14 +8,14 @@ from typing import Literal, get_args
 from slimsfm.domination import Solution
 from slimsfm.errors import InputError
 from slimsfm.graph import GraphOptions, ReferenceGraph
+from slimsfm.graph.edge_sources import Edges
 from slimsfm.graph.io import read_given_graph
-from slimsfm.graph.options import Edges
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.io import weigh_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images, with_points
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction.choice import DOMINATING, Candidate, apply_choice
+from slimsfm.reduction.choice import DOMINATING, Candidate, ReductionLimits, apply_choice, recommend
 from slimsfm.reduction.image_sets import (
     Cost,
     DominatingSetOptions,
@@ -24,7 +24,6 @@ from slimsfm.reduction.image_sets import (
     images_within,
     keep_random_images,
 )
-from slimsfm.reduction.limits import ReductionLimits, recommend
 from slimsfm.reduction.pareto import (
     FrontierOptions,
     GraphProvider,

@@ -1,8 +1,7 @@
 """Which 3D points of a map to keep: selectors behind one protocol."""
 
-from slimsfm.selection.baselines import kcover, random_points
-from slimsfm.selection.pose_information import information
 from slimsfm.selection.problem import ImagesOfPoints, SelectionProblem, Selector
+from slimsfm.selection.selectors import information, kcover, random_points
 
 SELECTORS: dict[str, Selector] = {
     "information": information,

@@ -15,8 +15,7 @@ import pycolmap
 from slimsfm.arrays import Points2D
 from slimsfm.geometry import Box, corner_error, project
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose, refine_pose
-from slimsfm.tracking.gray_frame import GrayFrame, follow_points
-from slimsfm.tracking.templates import FoundTemplates, Templates, find_templates
+from slimsfm.tracking.templates import FoundTemplates, GrayFrame, Templates, find_templates, follow_points
 
 MAX_CORNER_ERROR = 0.03
 """Largest predicted corner error, over the diagonal, of an accepted pose: points on a small area, such as a

@@ -11,10 +11,15 @@ from slimsfm.arrays import Image, Points2D
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
-from slimsfm.tracking.background import BackgroundLocalization, BackgroundResult
-from slimsfm.tracking.gray_frame import GrayFrame, to_gray_frame
-from slimsfm.tracking.relocalization import Relocalizer, is_ambiguous
-from slimsfm.tracking.templates import Templates, cut_templates, join_templates, spread_over_cells
+from slimsfm.tracking.background import BackgroundLocalization, BackgroundResult, Relocalizer, is_ambiguous
+from slimsfm.tracking.templates import (
+    GrayFrame,
+    Templates,
+    cut_templates,
+    join_templates,
+    spread_over_cells,
+    to_gray_frame,
+)
 from slimsfm.tracking.track import Track, begin_track, follow_track, smoothed_pose
 
 State = Literal["tracked", "localized", "lost"]

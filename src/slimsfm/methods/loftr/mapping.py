@@ -5,23 +5,198 @@ References:
         without CAD Models, NeurIPS 2022.
 """
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from jaxtyping import Float64, Int64
 from threadpoolctl import threadpool_limits
 
+from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
 from slimsfm.mapping.extraction import color_points, mask_of
-from slimsfm.mapping.pairs import Pairs, verify_pairs
+from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
 from slimsfm.mapping.sfm import reconstruct, triangulate, verified_matches, write_database
-from slimsfm.methods.loftr.cells import CellKeypoints, Matches, match_without_keypoints
-from slimsfm.methods.loftr.image_matching import ImageMatcher, Photo
-from slimsfm.methods.loftr.refinement import refine_model
+from slimsfm.methods.loftr.cells import (
+    CellKeypoints,
+    EncodedImage,
+    ImageMatcher,
+    Photo,
+    in_tiles,
+    match_without_keypoints,
+)
+from slimsfm.methods.loftr.rays import (
+    Depths,
+    RayObservations,
+    Tracks,
+    choose_references,
+    rays_of,
+    read_tracks,
+    refine_depths,
+)
 from slimsfm.progress import ProgressBar, silent
+
+_CACHED = 24  # fully encoded images kept in memory: 45 MB each at 640 x 480
+
+Encode = Callable[[str], EncodedImage]
+"""Encodes the image with a given name."""
+
+_Rows = Int64[np.ndarray, " _"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementOptions:
+    """Which observations the refinement drops."""
+
+    max_error_cells: float = 0.5
+    """Largest reprojection error of an observation in cells; half a cell is 4 pixels of the matcher's
+    input."""
+
+    def __post_init__(self) -> None:
+        if not self.max_error_cells > 0:
+            raise ValueError(f"max_error_cells must be positive, got {self.max_error_cells}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedModel:
+    """A model with refined keypoints, only those that observe a point."""
+
+    model: pycolmap.Reconstruction
+    """Ids, names, cameras and poses are unchanged."""
+
+    features: Mapping[str, Features]
+    """Keypoints by image name, with the matcher's descriptors in half precision."""
+
+    rows: Mapping[str, _Rows]
+    """Row of each keypoint before the refinement, ascending, by image name."""
+
+    def matches(self, before: Matches) -> Matches:
+        """Renumber matches from before the refinement, without those of dropped keypoints."""
+        kept = {(a, b): self._kept(a, b, before[a, b]) for a, b in sorted(before)}
+        return {pair: pairs for pair, pairs in kept.items() if len(pairs)}
+
+    def _kept(self, a: str, b: str, pairs: IndexPairs) -> Int64[np.ndarray, "k 2"]:
+        both = np.isin(pairs[:, 0], self.rows[a]) & np.isin(pairs[:, 1], self.rows[b])
+        columns = zip((a, b), pairs[both].T, strict=True)
+        return np.stack([np.searchsorted(self.rows[name], rows) for name, rows in columns], axis=1)
+
+
+def refine_model(
+    model: pycolmap.Reconstruction,
+    cells: CellKeypoints,
+    photos: Mapping[str, Photo],
+    matcher: ImageMatcher,
+    options: RefinementOptions = RefinementOptions(),
+    progress: ProgressBar = silent,
+) -> RefinedModel:
+    """Align the observations of each point with its reference, and move the point accordingly.
+
+    Poses and cameras do not change.
+
+    Args:
+        model: A model whose keypoints are those of `cells`, row by row.
+        cells: The cells from which it was reconstructed.
+        photos: Photos by name, read on access.
+        matcher: The matcher of these cells.
+        options: Which observations to drop.
+        progress: Progress callback.
+    """
+    tracks = read_tracks(model)
+    is_reference = choose_references(tracks)
+    encode = lru_cache(_CACHED)(lambda name: matcher.encode(photos[name]))
+    tracks = replace(tracks, points2D=_align(tracks, is_reference, matcher, encode, progress))
+    limits = options.max_error_cells * np.array([cells.cell_px[name] for name in tracks.names])
+    rays = rays_of(model, tracks, is_reference)
+    depths, agrees = _fit(rays.observations, rays.depths, limits[tracks.images[rays.others]])
+    tracks = replace(tracks, points3D_in_world=rays.points3D_in_world(depths))
+    kept = _kept(tracks, is_reference, rays.others[agrees])
+    parts = [kept[tracks.images[kept] == image] for image in range(len(tracks.names))]
+    features = {
+        name: _described(cells.features[name], tracks, part, matcher, encode(name))
+        for name, part in progress(list(zip(tracks.names, parts, strict=True)), "describe keypoints")
+    }
+    return RefinedModel(
+        model=_with_tracks(model, tracks, parts),
+        features=features,
+        rows={name: tracks.keypoints[part] for name, part in zip(tracks.names, parts, strict=True)},
+    )
+
+
+def _described(
+    before: Features, tracks: Tracks, part: _Rows, matcher: ImageMatcher, encoded: EncodedImage
+) -> Features:
+    """Features of an image with refined keypoints."""
+    pixels = tracks.points2D[part]
+    return replace(
+        before[tracks.keypoints[part]],
+        keypoints=pixels.astype(np.float32),
+        descriptors=matcher.describe(encoded, pixels),
+    )
+
+
+def _align(
+    tracks: Tracks, is_reference: Mask, matcher: ImageMatcher, encode: Encode, progress: ProgressBar
+) -> Points2D:
+    """Pixels of all observations, aligned with the reference of their point."""
+    references, others = np.flatnonzero(is_reference), np.flatnonzero(~is_reference)
+    references = references[tracks.points[others]]
+    points2D = tracks.points2D.copy()
+    by_pair: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for row, images in enumerate(zip(tracks.images[references], tracks.images[others], strict=True)):
+        one, other = (tracks.names[image] for image in images)
+        by_pair[one, other].append(row)
+    for pair in progress(in_tiles(list(by_pair), _CACHED // 2), "align keypoints"):
+        one, other = references[by_pair[pair]], others[by_pair[pair]]
+        places = tracks.points2D[one], tracks.points2D[other]
+        points2D[other] = matcher.align(encode(pair[0]), encode(pair[1]), *places)
+    return points2D
+
+
+def _fit(
+    observations: RayObservations, depths: Depths, limits_px: Float64[np.ndarray, " n"]
+) -> tuple[Depths, Mask]:
+    """Fit depths to the observations, without outliers; also returns which observations are inliers."""
+    agrees = np.ones(len(observations.points), dtype=bool)
+    for _ in range(2):
+        depths = refine_depths(observations[np.flatnonzero(agrees)], depths)
+        agrees &= observations.errors(depths) <= limits_px
+    return depths, agrees
+
+
+def _kept(tracks: Tracks, is_reference: Mask, agreeing: Int64[np.ndarray, " _"]) -> Int64[np.ndarray, " _"]:
+    """Inliers and the references of their points, sorted by image, then keypoint."""
+    kept = is_reference & np.isin(tracks.points, tracks.points[agreeing])
+    kept[agreeing] = True
+    rows = np.flatnonzero(kept)
+    return rows[np.lexsort([tracks.keypoints[rows], tracks.images[rows]])]
+
+
+def _with_tracks(
+    model: pycolmap.Reconstruction, tracks: Tracks, parts: list[_Rows]
+) -> pycolmap.Reconstruction:
+    """Copy a model with only these observations and their points."""
+    refined = pycolmap.Reconstruction(model)
+    refined.delete_all_points2D_and_points3D()
+    elements: dict[int, list[pycolmap.TrackElement]] = defaultdict(list)
+    ids = {image.name: image_id for image_id, image in model.images.items()}
+    for name, mine in zip(tracks.names, parts, strict=True):
+        pixels = [pycolmap.Point2D(xy) for xy in tracks.points2D[mine]]
+        refined.image(ids[name]).points2D = pycolmap.Point2DList(pixels)
+        for row, point in enumerate(tracks.points[mine].tolist()):
+            elements[point].append(pycolmap.TrackElement(ids[name], row))
+    for point, track in sorted(elements.items()):
+        point3D_id = int(tracks.point3D_ids[point])
+        moved = pycolmap.Point3D(xyz=tracks.points3D_in_world[point], color=model.point3D(point3D_id).color)
+        moved.track = pycolmap.Track(track)
+        refined.add_point3D_with_id(point3D_id, moved)
+    refined.update_point_3d_errors()
+    return refined
+
 
 _CELL_PX = 8.0  # side of a cell for which COLMAP's error limits of 4 pixels are right
 

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float16, Float64, UInt8
 from torch import Tensor
 
 from slimsfm.arrays import GrayImage, Points2D
-from slimsfm.methods.loftr.image_matching import AnyImage, ImageMatches
+from slimsfm.methods.loftr.cells import AnyImage, ImageMatches
 from slimsfm.methods.loftr.network import (
     CELL,
     FeatureMaps,
@@ -33,8 +33,7 @@ from slimsfm.methods.loftr.network import (
     match_cells,
     sample,
 )
-from slimsfm.networks.devices import choose_device, inference
-from slimsfm.networks.loading import load_network, matcher_state
+from slimsfm.networks.loading import choose_device, inference, load_network, matcher_state
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -20,8 +20,8 @@ from torch import Tensor
 from slimsfm.arrays import Descriptors, Ids, Points2D
 from slimsfm.errors import MapError
 from slimsfm.features import Extractor, load_extractor, unit_rows
-from slimsfm.localization.direct import Direct
 from slimsfm.localization.matching import matching_with
+from slimsfm.localization.strategies import Direct
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.methods.onepose.crop import (
@@ -38,8 +38,7 @@ from slimsfm.methods.onepose.crop import (
 )
 from slimsfm.methods.onepose.network import DIMENSIONS, THRESHOLD, GraphAttentionMatcher, mutual_matches
 from slimsfm.methods.onepose.points import in_box, prepare_points
-from slimsfm.networks.devices import choose_device
-from slimsfm.networks.loading import load_network, matcher_state
+from slimsfm.networks.loading import choose_device, load_network, matcher_state
 
 _EXTRACTOR = "superpoint"
 _FEWEST = 2  # keypoints and points: the network normalizes over them

@@ -23,7 +23,7 @@ from slimsfm.arrays import Image
 from slimsfm.errors import MapError
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target
 from slimsfm.mapping.map import Map, check_has_features
-from slimsfm.methods.loftr.image_matching import EncodedImage, ImageMatcher
+from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher
 from slimsfm.methods.loftr.matcher import Loftr
 from slimsfm.methods.onepose.crop import (
     CROP_PX,
@@ -39,8 +39,7 @@ from slimsfm.methods.onepose.crop import (
 )
 from slimsfm.methods.onepose.points import OnePosePoints, OnePosePointsOptions, prepare_points
 from slimsfm.methods.onepose_plus.network import CoarseToFine, OnePosePlusMatcher
-from slimsfm.networks.devices import choose_device, inference
-from slimsfm.networks.loading import load_network, matcher_state
+from slimsfm.networks.loading import choose_device, inference, load_network, matcher_state
 from slimsfm.weights import WEIGHTS
 
 _POINTS = OnePosePointsOptions(max_points=15000, leaves=0)  # as in the authors' code

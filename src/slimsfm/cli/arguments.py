@@ -1,10 +1,69 @@
-"""Amounts with units, and limits, as a user writes them."""
+"""Options of commands: where the work runs."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
 
 from slimsfm.errors import InputError
+from slimsfm.execution import OpenExecutor, dask_cluster, num_cores, processes
 from slimsfm.reduction import ReductionLimits
+from slimsfm.weights import Runtime, use_runtime
+
+
+@dataclass(frozen=True, kw_only=True)
+class Execution:
+    """Processes or machines that share the work."""
+
+    workers: int | None = None
+    """Number of worker processes, by default the number of cores. 1 starts no other process."""
+
+    scheduler: str | None = None
+    """Address of the scheduler of a Dask cluster (tcp://...), or `local` to start one on this machine."""
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers must be at least 1, got {self.workers}")
+
+    def open_executor(self) -> OpenExecutor | None:
+        """Return a function that opens the executor; None if the work runs in this process."""
+        workers = self.workers or num_cores()
+        if self.scheduler:
+            address = None if self.scheduler == "local" else self.scheduler
+            return partial(dask_cluster, address, workers)
+        return None if workers == 1 else partial(processes, workers)
+
+
+@contextmanager
+def resumable() -> Iterator[None]:
+    """Add to an interruption that finished work is saved."""
+    try:
+        yield
+    except KeyboardInterrupt as interruption:
+        raise KeyboardInterrupt("run the same command again to resume") from interruption
+
+
+@dataclass(frozen=True, kw_only=True)
+class Networks:
+    """Weights and device of learned methods."""
+
+    weights: Path | None = None
+    """Folder of weight files; by default $SLIMSFM_WEIGHTS, then the caches of the libraries."""
+
+    device: Literal["auto", "cpu", "cuda"] | None = None
+    """Where networks run; `auto` takes a GPU if there is one. The default is $SLIMSFM_DEVICE."""
+
+    def apply(self) -> None:
+        """Use these for all networks of the command, including those in its worker processes.
+
+        Raises:
+            InputError: The folder does not exist.
+        """
+        use_runtime(Runtime.from_environment(self.weights, self.device))
+
 
 _BYTES = {"": 1.0, "b": 1.0, "kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30}
 

@@ -12,14 +12,16 @@ import pycolmap
 from jaxtyping import Float32, Float64, Int64
 from scipy.sparse import csr_array
 
-from slimsfm.arrays import Descriptors
-from slimsfm.features.vlad import vlad
-from slimsfm.localization.matching import ReferenceMatching, matching_with
+from slimsfm.arrays import Descriptors, Ids
+from slimsfm.features import unit_rows
+from slimsfm.features.nearest import vlad
+from slimsfm.localization.matching import ReferenceMatching, match_target, matching_with
+from slimsfm.localization.point_descriptors import descriptor_sums, mean_descriptors
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target, unite
 from slimsfm.mapping.descriptors import describe_images
 from slimsfm.mapping.map import Map, check_has_features, observed
 
-_STRONGEST = 2048  # keypoints that the global descriptor of a query is computed from
+_DESCRIBED = 2048  # keypoints that the global descriptor of a query is computed from
 
 
 class Exhaustive:
@@ -146,5 +148,118 @@ class ImageRanking:
             descriptors: Local descriptors of the query, strongest keypoint first.
         """
         return self._global_descriptors.descriptors @ vlad(
-            descriptors[:_STRONGEST], self._global_descriptors.vocabulary
+            descriptors[:_DESCRIBED], self._global_descriptors.vocabulary
         )
+
+
+_EARLY_ROUNDS = (1024,)  # keypoints per round before the last, which takes all
+_NARROWEST = 0.5  # cosine: a point may be visible 60 degrees away from where it was seen
+
+
+class Direct:
+    """Matches against all described points at once. O(keypoints x points) per query."""
+
+    requires = "points"
+
+    def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:  # noqa: ARG002
+        self._nearest = map.descriptor_metric
+        self._described = map.point_descriptors or mean_descriptors(map)
+        self._positions = map.points3D_in_world[self._described.points].astype(np.float32)
+        self._target = self._described.descriptors, self._described.points
+
+    def rounds(self, query: Query) -> Rounds:
+        """Match the strongest keypoints with the points' mean descriptors, then all keypoints."""
+        counts = [count for count in _EARLY_ROUNDS if count < len(query.descriptors)]
+        for count in (*counts, len(query.descriptors)):
+            yield unite([match_target(query.descriptors[:count], self._target, self._nearest)])
+
+    def visible_points(
+        self,
+        cam_from_world: pycolmap.Rigid3d,
+        agreeing: Int64[np.ndarray, " _"] | None = None,  # noqa: ARG002
+    ) -> Target:
+        """The points that were seen from about the position of the camera.
+
+        The mean of unit vectors spread over a cone has the length (1 + cosine of the half angle) / 2, so the
+        length of a point's direction gives the range of angles it was seen from.
+        """
+        if self._described.directions is None:
+            return self._target
+        towards = cam_from_world.inverse().translation.astype(np.float32) - self._positions
+        lengths = np.linalg.norm(self._described.directions, axis=1)
+        least = np.minimum(_NARROWEST, 2 * lengths - 1)
+        products = np.einsum("nd,nd->n", towards, self._described.directions)
+        facing = np.flatnonzero(products >= least * lengths * np.linalg.norm(towards, axis=1))
+        return self._described.descriptors[facing], self._described.points[facing]
+
+
+_FIRST, _STRONGEST = 1024, 2048  # keypoints matched with landmarks, and with images before the last round
+_GROWTH = 0.6  # growth of the number of images from round to round, so that few poses are estimated
+_TRIED = 0.5  # share of the images after which everything is matched with everything
+_PER_IMAGE = 60  # landmarks that each image sees, if it sees as many points
+_LANDMARKS = 1000  # landmarks per map, at most
+
+
+class Progressive:
+    """Matches with the most likely images first, and with all of them if the pose stays unsure."""
+
+    def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
+        self._nearest = map.descriptor_metric
+        self._references = ReferenceImages(map, options)
+        self._ranking = ImageRanking(map)
+        landmarks = choose_landmarks(map)
+        self._landmarks = unit_rows(descriptor_sums(map))[landmarks], landmarks
+
+    def rounds(self, query: Query) -> Rounds:
+        """Match in rounds: the landmarks, one image, a second one, then more per round; last all with all."""
+        parts = [match_target(query.descriptors[:_FIRST], self._landmarks, self._nearest)]
+        matches = unite(parts)
+        pose = yield matches
+        similarities, tried = self._ranking.similarities(self._references.describe(query)), []
+        while len(tried) < _TRIED * len(self._references):
+            agreeing = matches.points[pose.inliers] if pose else matches.points
+            for _ in range(max(1, round(_GROWTH * len(tried)))):
+                tried.append(self._next(similarities, tried, agreeing))
+                parts.append(self._references.match(query, tried[-1:], _STRONGEST))
+            matches = unite(parts)
+            pose = yield matches
+        yield self._references.match(query)
+
+    def _next(self, similarities: Float32[np.ndarray, " references"], tried: list[int], agreeing: Ids) -> int:
+        """The most useful image not tried yet: in turn one to confirm the pose and one to refute it."""
+        score = similarities.copy()
+        if len(tried) % 2 == 0 and len(agreeing):
+            score += self._references.sharing(agreeing) / len(agreeing)
+        elif tried:
+            score -= self._references.known_from(tried)
+        score[tried] = -np.inf
+        return int(score.argmax())
+
+    def visible_points(
+        self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
+    ) -> Target:
+        """The points that one reference image near the pose sees."""
+        return self._references.visible_points(cam_from_world, agreeing)
+
+
+def choose_landmarks(map: Map) -> Ids:
+    """Choose a few points such that each reference image sees some of them.
+
+    Takes the points with most observations first, until each image sees enough. Skips a point if all images
+    that observe it see enough landmarks already. O(observations).
+
+    Returns:
+        Rows of the map's points, ascending.
+    """
+    seen_by = observed(map).T.tocsr()
+    order = np.argsort(-np.diff(seen_by.indptr), kind="stable")
+    counts = np.zeros(len(map.images), np.int64)
+    chosen: list[int] = []
+    for point in order.tolist():
+        images = seen_by.indices[seen_by.indptr[point] : seen_by.indptr[point + 1]]
+        if np.any(counts[images] < _PER_IMAGE):
+            chosen.append(point)
+            counts[images] += 1
+            if len(chosen) == _LANDMARKS or counts.min() >= _PER_IMAGE:
+                break
+    return np.array(sorted(chosen), np.int64)
