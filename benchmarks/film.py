@@ -135,7 +135,7 @@ def _path(rng: np.random.Generator, frames: int, cut: int, radius: float) -> lis
     azimuths = 0.6 - 0.3 * time + 2.4 * after + np.radians(_tremor(rng, time, 1.0))
     elevations = np.radians(34 + 9 * np.sin(2 * np.pi * time / 7.3) + 12 * after)
     radii = radius * (1 + 0.12 * np.sin(2 * np.pi * time / 5.1) - 0.08 * after)
-    eyes = eyes(azimuths, elevations, radii)
+    positions = eyes(azimuths, elevations, radii)
     fast = _pass(share, _PANS)
     pans = _PAN * fast * np.sin(2 * np.pi * _PAN_HZ * time) + _tremor(rng, time, 0.8)
     tilts = 3 * fast * np.sin(2 * np.pi * 0.8 * time) + _tremor(rng, time, 0.8)
@@ -143,7 +143,7 @@ def _path(rng: np.random.Generator, frames: int, cut: int, radius: float) -> lis
     turns = np.radians(np.stack([tilts, pans, np.zeros(frames)], axis=1))
     return [
         _turned(turn) * look_at(eye, np.zeros(3), float(roll))
-        for eye, turn, roll in zip(eyes, turns, rolls, strict=True)
+        for eye, turn, roll in zip(positions, turns, rolls, strict=True)
     ]
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from slimsfm.errors import ImageError, InputError
 from slimsfm.mapping.map import Map
 from slimsfm.photos import camera_from_exif
-from slimsfm.pose.priors import Gravity
+from slimsfm.pose.types import Gravity
 
 FocalLength = Literal["known", "approximate", "unknown"]
 """How well the focal length of a query is known. If it is not known, it is estimated with the pose."""

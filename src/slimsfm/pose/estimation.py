@@ -4,11 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Float64
 
-from slimsfm.arrays import Mask, Points2D, Points3D
-from slimsfm.geometry import Box, motions
-from slimsfm.pose.priors import FocalPrior, Gravity, check_has_focal_length, with_focal_length
+from slimsfm.arrays import Points2D, Points3D
 from slimsfm.pose.ransac import (
     P3P_SAMPLE,
     PinholeMatches,
@@ -19,114 +16,14 @@ from slimsfm.pose.ransac import (
     search_upright,
 )
 from slimsfm.pose.refinement import refine_pose
-
-MIN_SIGMA_PX = 0.5
-"""Smallest standard deviation of a keypoint that a covariance assumes: no detector is more accurate."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PoseEstimate:
-    """The pose of a camera, and the matches that support it."""
-
-    cam_from_world: pycolmap.Rigid3d
-    """The pose."""
-
-    inliers: Mask
-    """Which of the given matches agree with the pose."""
-
-    covariance: Float64[np.ndarray, "6 6"] | None = None
-    """Covariance of the small motion in the camera's frame (rotation in radians, then translation in map
-    units) from this pose to the true one, assuming that the inliers are correct. None where it was not
-    computed."""
-
-    confidence: float | None = None
-    """Probability that the pose is right: that its corner error is below a tenth of the diagonal. None where
-    the pose was not verified."""
-
-    camera: pycolmap.Camera | None = None
-    """The given camera with the estimated focal length; None where the focal length was known."""
-
-    relative_focal_sigma: float | None = None
-    """Standard deviation of the estimated focal length, divided by the focal length. Where the matches do not
-    determine it, as on a wall seen from the front, it is about as large as that of the prior. None where the
-    focal length was known."""
-
-    @property
-    def num_inliers(self) -> int:
-        """Number of matches that agree with the pose."""
-        return int(self.inliers.sum())
-
-    def predicted_corner_error(self, box: Box) -> float:
-        """Predict the relative corner error, assuming that the inliers are correct.
-
-        The covariance is propagated to the corners of the box. The prediction is the mean over the eight
-        corners of the root mean square displacement of each, divided by the diagonal: the counterpart of
-        `geometry.corner_error`, which is a mean of distances. See `rms_corner_errors` for the other average.
-
-        Raises:
-            ValueError: The pose has no covariance.
-        """
-        if self.covariance is None:
-            raise ValueError("covariance must not be None to predict an error; estimate_pose computes it")
-        moved = motions(self.cam_from_world * box.corners)
-        squares = np.einsum("nia,ab,nib->n", moved, self.covariance, moved)
-        return float(np.sqrt(np.maximum(squares, 0)).mean() / box.diagonal)
-
-
-def rms_corner_errors(
-    covariances: Float64[np.ndarray, "n 6 6"], corner_motions: Float32[np.ndarray, "n 24 6"]
-) -> Float64[np.ndarray, " n"]:
-    """Root mean square displacement over all corners of the box, in diagonals, for many poses at once.
-
-    It is an upper bound of `PoseEstimate.predicted_corner_error`, usually a few percent larger, and needs one
-    batched product. Choosing points only compares poses with it, thousands of times per choice; everything
-    that is reported or thresholded uses `predicted_corner_error`.
-
-    Args:
-        covariances: Covariances of the poses' six parameters.
-        corner_motions: How the 24 coordinates of the corners, in diagonals, change with these parameters.
-    """
-    squares = np.einsum("nca,nca->n", corner_motions @ covariances, corner_motions)
-    return np.sqrt(squares / 8)
-
-
-def projection_jacobian(points3D_in_cam: Points3D, focal_px: float) -> Float64[np.ndarray, "n 2 6"]:
-    """How the pixels of points change with a motion in the camera's frame, for an ideal pinhole camera.
-
-    Args:
-        points3D_in_cam: Points in the camera's frame.
-        focal_px: Focal length in pixels.
-
-    Returns:
-        Pixels per radian of rotation (first three columns) and per map unit of translation.
-    """
-    x, y, z = points3D_in_cam.T
-    zero = np.zeros_like(z)
-    pixels_from_cam = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]]).transpose(2, 0, 1)
-    return focal_px * pixels_from_cam @ motions(points3D_in_cam)
-
-
-def pose_covariance(
-    pinhole_points2D: Points2D, points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, focal_px: float
-) -> Float64[np.ndarray, "6 6"]:
-    """Covariance of a pose from matches: the inverse of their information, scaled by their residuals.
-
-    The variance of a pixel is that of the reprojection errors, but at least that of `MIN_SIGMA_PX`. Where the
-    matches leave a motion of the camera free, for example when all lie on one line, its variance is huge.
-
-    Args:
-        pinhole_points2D: Pixels of an ideal pinhole camera, principal point (0, 0).
-        points3D_in_world: The point matched with each pixel.
-        cam_from_world: The pose.
-        focal_px: Focal length in pixels.
-    """
-    in_cam = cam_from_world * points3D_in_world
-    jacobian = projection_jacobian(in_cam, focal_px).reshape(-1, 6)
-    squares = np.sum((focal_px * in_cam[:, :2] / in_cam[:, 2:] - pinhole_points2D) ** 2)
-    variance = max(squares / max(2 * len(in_cam) - 6, 1), MIN_SIGMA_PX**2)
-    values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
-    return variance * (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T
-
+from slimsfm.pose.types import (
+    FocalPrior,
+    Gravity,
+    PoseEstimate,
+    check_has_focal_length,
+    pose_covariance,
+    with_focal_length,
+)
 
 _MIN_INLIERS = 4  # of a hypothesis at a focal length that may be wrong
 _MAX_SIGMAS = 4  # by which a pose may deviate from gravity; one in 3000 does
