@@ -9,9 +9,16 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.geometry import motions, project, reprojection_errors
-from slimsfm.pose.estimation import PoseEstimate, pose_covariance
 from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
-from slimsfm.pose.types import MIN_SIGMA_PX, FocalPrior, Gravity, Prior, with_focal_length
+from slimsfm.pose.types import (
+    MIN_SIGMA_PX,
+    FocalPrior,
+    Gravity,
+    PoseEstimate,
+    Prior,
+    pose_covariance,
+    with_focal_length,
+)
 
 _ROUNDS = 8  # of choosing inliers; 2 to 4 are common
 _STEPS = 30  # of Levenberg-Marquardt per round; 5 are common
