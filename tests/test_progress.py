@@ -17,7 +17,11 @@ def drawn(console):
     return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]|\r", "", console.file.getvalue())
 
 
-@pytest.mark.parametrize("progress", [silent, shown, PlainLines(), TerminalBars(terminal())], ids=repr)
+@pytest.mark.parametrize(
+    "progress",
+    [silent, shown, PlainLines(), TerminalBars(terminal())],
+    ids=["silent", "shown", "lines", "bars"],
+)
 @pytest.mark.parametrize("items", [[], ["a"], ["a", "b", "c"]])
 def test_items_are_unchanged(progress, items):
     assert list(progress(items, "work")) == items
