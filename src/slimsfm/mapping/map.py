@@ -87,7 +87,7 @@ class GlobalDescriptors:
     """Global descriptors (VLAD) of the reference images, which rank them by similarity to a query."""
 
     vocabulary: Float32[np.ndarray, "words d"]
-    """Cluster centers of local descriptors, see `features.vlad`."""
+    """Cluster centers of local descriptors, see `features.nearest`."""
 
     descriptors: Float32[np.ndarray, "images values"]
     """Global descriptor per reference image in order of name, of unit length."""
