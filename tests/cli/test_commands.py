@@ -77,11 +77,13 @@ def test_info_says_what_kind_of_map_it_is(boulder, tmp_path):
     arguments = ("--max-points", 60, "--selector", "kcover")
     assert slimsfm("reduce", boulder.map_path, "-o", small, *arguments).code == 0
     said = slimsfm("info", small).out
-    assert re.search(r"^kind +points for direct matching, reduced from a full map$", said, re.MULTILINE)
+    assert re.search(
+        r"^map +\d+ points for direct matching, reduced from \d+ images \(.+\)$", said, re.MULTILINE
+    )
     assert re.search(r"^points +60 points$", said, re.MULTILINE)
     assert "observation" not in said
     full = slimsfm("info", boulder.map_path).out
-    assert re.search(r"^kind +images with local features$", full, re.MULTILINE)
+    assert re.search(r"^map +\d+ images with \d+ points \(.+\)$", full, re.MULTILINE)
     assert re.search(r"^box +given, diagonal \d\.\d+ metre$", full, re.MULTILINE)
     assert re.search(r"mean reprojection error \d\.\d\d px", full)
 

@@ -29,7 +29,7 @@ def info(map: MapPath, /, json: bool = False, images: bool = False) -> None:
 def _facts(map: Map, sizes: dict[str, int]) -> dict:
     box, parts = map.box, counts(map)
     return {
-        "kind": _kind(map),
+        "kind": map.kind,
         "images": list(map.images),
         "points": parts["points"],
         "observations": parts["observations"],
@@ -58,22 +58,10 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
     options = ", ".join(f"{key} {value}" for key, value in info.extractor_options.items())
     unit = "map units (unknown scale)" if info.unit == "unknown" else info.unit
     return {
-        "kind": _kind(map),
-        "origin": info.origin,
+        "map": map.describe(),
         "images": f"{len(map.images)}{matches}",
         "points": points,
         "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
         "extractor": info.extractor + (f" ({options})" if options else ""),
         "size": ", ".join(f"{part} {size(number)}" for part, number in sizes.items()),
     }
-
-
-def _kind(map: Map) -> str:
-    """What queries are matched with."""
-    if map.is_for_direct_matching:
-        return "points for direct matching, reduced from a full map"
-    if map.photos:
-        return "photos to match without a detector"
-    if map.point_descriptors:
-        return "images with local features, and points for direct matching"
-    return "images with local features"
