@@ -21,7 +21,9 @@ def test_the_python_lines_run_and_print_a_pose(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", lines[0]], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    assert len(re.findall(r"-?\d\.\d+", done.stdout)) == 12
+    *matrix, confidence = map(float, re.findall(r"-?\d\.\d+", done.stdout))
+    assert len(matrix) == 12
+    assert 0.5 <= confidence <= 1
 
 
 def test_the_two_commands_are_given():

@@ -232,8 +232,8 @@ def test_bad_options_of_localize(refused, boulder, tmp_path, arguments, naming):
             "strategy must be auto or one of direct, exhaustive, onepose, onepose++, progressive, ",
         ),
         ("benchmark images", ("--variants", "half"), "variants must be among"),
-        ("benchmark images", ("--query-every", "0"), "query_every 0"),
-        ("benchmark images", ("--query-every", "1"), "query_every 1"),
+        ("benchmark images", ("--query-every", "0"), "--query-every 0"),
+        ("benchmark images", ("--query-every", "1"), "--query-every 1"),
     ],
     ids=str,
 )

@@ -128,7 +128,7 @@ def test_a_broken_object_does_not_stop_the_others(boulder, tmp_path):
     done = slimsfm(*arguments)
     assert done.code == 2
     assert str(pose) in done.err
-    assert "1 of 2 objects failed" in done.err
+    assert "1 of 2 objects could not be measured" in done.err
     run = read_run(tmp_path / "run")
     assert [one.name for one in run.objects] == [NAME]
     assert list(run.failed) == ["broken"]

@@ -53,7 +53,7 @@ def test_wrong_inputs_are_reported_in_one_line(map_path, queries, tmp_path):
         ((direct, *out), "reduce the full map for images instead"),
         ((tmp_path / "nowhere", *out), f"{tmp_path / 'nowhere'}: not a map"),
         ((map_path, *out, "--queries", tmp_path / "nobody"), f"{tmp_path / 'nobody'}: neither a folder"),
-        ((map_path, *out, "--queries", tmp_path / "own.txt"), "'003.png' is called as an image of the map"),
+        ((map_path, *out, "--queries", tmp_path / "own.txt"), "'003.png' has the name of an image"),
         ((map_path, "-o", map_path, "--overwrite"), "is or contains the input"),
         ((map_path, "-o", queries, "--queries", queries, "--overwrite"), "is or contains the input"),
         ((map_path,), "see slimsfm export hloc --help"),

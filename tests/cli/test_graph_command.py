@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from commands import contents, slimsfm
-from slimsfm import execution
 from slimsfm.cli.arguments import Execution
 from slimsfm.domination import dominates
 from slimsfm.errors import WorkError
@@ -92,7 +91,7 @@ def test_a_map_without_matches_has_other_ways(bare, edges):
 
 
 def test_a_map_without_matches_is_told_so(refused, bare, tmp_path):
-    naming = "has no matches; set edges to tracks or localize"
+    naming = "has no matches; use --edges tracks or --edges localize"
     refused("graph", bare, "--edges", "matches", naming=naming)
     refused("reduce", bare, "-o", tmp_path / "slim", "--edges", "matches", naming=naming)
 
@@ -121,8 +120,7 @@ def test_what_is_there_is_not_replaced_unasked(refused, a_map, tmp_path, option)
     assert taken.read_bytes() != b"mine"
 
 
-def test_a_scheduler_that_does_not_answer(a_map, monkeypatch):
-    monkeypatch.setattr(execution, "_CONNECT_S", 0.3)
+def test_a_scheduler_that_does_not_answer(a_map):
     elsewhere = Execution(scheduler="tcp://127.0.0.1:1").open_executor()
     with pytest.raises(WorkError, match=r"^tcp://127\.0\.0\.1:1: no Dask scheduler answers there"):
         load_or_compute_graph(read_map(a_map), a_map, TRACKS, elsewhere, min_seconds=0.0)

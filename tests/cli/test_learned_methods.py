@@ -105,5 +105,8 @@ def test_missing_weights_are_named_before_anything_is_written(boulder, tmp_path)
     )
     assert found.returncode == 2
     (line,) = messages(found.stderr)
-    assert "weights superpoint_v1.pth are missing; get them from the SuperGluePretrainedNetwork" in line
+    assert (
+        "weights superpoint_v1.pth are missing and could not be downloaded; get them from the SuperGlue"
+        in line
+    )
     assert not out.exists()

@@ -124,7 +124,7 @@ def test_a_map_of_points_is_described_and_refused_where_features_are_needed(poin
     for command in (("graph", pointed.path), ("frontier", pointed.path)):
         (line,) = slimsfm(*command).err.splitlines()
         assert "direct matching alone" in line
-        assert "use the map that it was made of" in line
+        assert "use the map that it was reduced from" in line
     assert contents(pointed.path) == before
     assert list(tmp_path.iterdir()) == []
 

@@ -133,7 +133,7 @@ def test_it_can_be_pickled(project):
 
 
 def test_two_sources_of_descriptors_are_an_error(project, tmp_path):
-    with pytest.raises(ValueError, match="give just one source"):
+    with pytest.raises(ValueError, match="give only one source"):
         replace(project, database=tmp_path / "database.db")
     with pytest.raises(ValueError, match="matches needs features"):
         Colmap(path=tmp_path, images=tmp_path, matches=tmp_path / "matches.h5")

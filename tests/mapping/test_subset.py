@@ -86,7 +86,7 @@ def test_the_map_itself_is_not_changed(tmp_path):
 
 
 def test_unknown_names_and_an_empty_list_are_input_errors():
-    with pytest.raises(InputError, match=r"'missing\.png' is not in the map"):
+    with pytest.raises(InputError, match=r"'missing\.png' is not one of the 8 images"):
         keep_images(PARTIAL, [NAMES[0], "missing.png"])
     with pytest.raises(InputError, match="no image to keep was given"):
         keep_images(PARTIAL, [])

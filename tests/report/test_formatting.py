@@ -7,6 +7,7 @@ from slimsfm.evaluation.comparison import Comparison
 from slimsfm.evaluation.results import MappedObject
 from slimsfm.evaluation.scores import Interval
 from slimsfm.report.formatting import (
+    format_count,
     format_difference,
     format_dominating_set,
     format_error,
@@ -14,7 +15,6 @@ from slimsfm.report.formatting import (
     format_line,
     format_map,
     format_ratio,
-    plural,
 )
 
 COMPARISON = Comparison(
@@ -43,7 +43,7 @@ TIMES = "\N{MULTIPLICATION SIGN}"
 
 
 def test_counts_have_plurals():
-    assert [plural(1, "query"), plural(1234, "query"), plural(0, "image")] == [
+    assert [format_count(1, "query"), format_count(1234, "query"), format_count(0, "image")] == [
         "1 query",
         "1,234 queries",
         "0 images",

@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from slimsfm.cli.arguments import Execution, resumable
-from slimsfm.cli.output import console, counts, size
+from slimsfm.cli.output import console, counts, plural, size
 from slimsfm.errors import InputError
 from slimsfm.evaluation.comparison import Comparison, DominationSummary
 from slimsfm.evaluation.formats import format_p_value, format_value, row_labels
@@ -20,7 +20,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.progress import shown
 from slimsfm.reduction import Candidate, Frontier, GraphProvider, Prediction, Reduced, ReduceOptions
 from slimsfm.reduction.pareto import check_reducible
-from slimsfm.report.formatting import format_ratio, plural
+from slimsfm.report.formatting import format_ratio
 
 
 def read_reducible(path: Path) -> Map:
@@ -54,10 +54,10 @@ def print_dominating_set(reduced: Reduced, options: ReduceOptions) -> None:
         return
     edges = graph.num_edges(options.image_choice.set_options().threshold)
     proof = "proven smallest" if solution.is_cheapest else f"at least {solution.lower_bound} are needed"
-    unmet = f"; {solution.unmet} images are localized by too few" if solution.unmet else ""
+    unmet = f"; localized by too few: {plural(solution.unmet, 'image')}" if solution.unmet else ""
     console.print(
-        f"reference graph: {edges} edges among {len(graph.names)} images; "
-        f"dominating set: {len(solution.chosen)} images ({proof}){unmet}"
+        f"reference graph: {plural(edges, 'edge')} among {plural(len(graph.names), 'image')}; "
+        f"dominating set: {plural(len(solution.chosen), 'image')} ({proof}){unmet}"
     )
 
 
@@ -78,17 +78,18 @@ def print_change(full_path: Path, full: Map, slim_path: Path, slim: Map) -> None
 def promise(full_path: Path, full: Map, candidate: Candidate) -> str:
     """Say in one sentence what is kept and how it is predicted to localize."""
     choice, tests = candidate.choice, len(candidate.prediction.tests)
-    before = f"{len(full.images)} images, {len(full.point3D_ids)} points, "
+    before = f"{plural(len(full.images), 'image')}, {plural(len(full.point3D_ids), 'point')}, "
     before += size(bytes_by_part(full_path)["total"])
-    images = f"{len(choice.images)} images, " if choice.images else ""
-    after = f"{images}{len(choice.points)} points, {size(candidate.bytes)}"
+    images = f"{plural(len(choice.images), 'image')}, " if choice.images else ""
+    after = f"{images}{plural(len(choice.points), 'point')}, {size(candidate.bytes)}"
     if not tests:
         return f"{before} -> {after}; no image is left out to predict by"
     found = candidate.full.within(ADD_FRACTIONS[0])
     share = 100 * candidate.prediction.within(ADD_FRACTIONS[0]) / found if found else 0.0
     return (
         f"{before} -> {after}; predicted to localize {min(share, 100):.3g} % of what the full map does, "
-        f"{candidate.full.seconds / candidate.seconds:.3g}x faster (measured on {tests} images left out)"
+        f"{candidate.full.seconds / candidate.seconds:.3g}x faster "
+        f"(measured on {plural(tests, 'image')} left out)"
     )
 
 

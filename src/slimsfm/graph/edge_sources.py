@@ -194,7 +194,7 @@ _NEAR = 2.0  # an error within this factor of the threshold may fall on either s
 _MIN_COMMON_POINTS = 20  # a pair without stored matches is worth matching from here
 
 
-class ReferenceImages:
+class PosedReferences:
     """The reference images of a map by index, and the step that all sources share: pose and error."""
 
     def __init__(self, map: Map, ransac: RansacOptions) -> None:
@@ -235,7 +235,7 @@ class MatchEdges:
     """
 
     def __init__(self, map: Map, options: GraphOptions) -> None:
-        self._references = ReferenceImages(map, options.ransac)
+        self._references = PosedReferences(map, options.ransac)
         self._points = lru_cache(_CACHED_IMAGES)(self._references.points_of)
 
     def pairs(self) -> PairIndices:
@@ -277,7 +277,7 @@ class TrackEdges:
     """
 
     def __init__(self, map: Map, options: GraphOptions) -> None:
-        self._references = ReferenceImages(map, options.ransac)
+        self._references = PosedReferences(map, options.ransac)
         self._min_points = options.ransac.min_inliers
         self._seen = lru_cache(_CACHED_IMAGES)(self._seen_by)
 
@@ -310,7 +310,7 @@ class LocalizeEdges:
     """
 
     def __init__(self, map: Map, options: GraphOptions) -> None:
-        self._references = ReferenceImages(map, options.ransac)
+        self._references = PosedReferences(map, options.ransac)
         self._options = options
         self._matching = matching_with(map, MatchingOptions(matcher=options.matcher), _CACHED_QUERIES)
         self._query = lru_cache(_CACHED_QUERIES)(self._read)

@@ -17,10 +17,10 @@ from slimsfm.report.formatting import (
     NO_VALUE,
     ColumnHead,
     NumberCell,
+    format_count,
     format_difference,
     format_error,
     format_line,
-    plural,
     table_html,
 )
 from slimsfm.report.frames import QueryFrame, frame_html
@@ -135,12 +135,12 @@ def _summary(comparison: Comparison, found: Sequence[QueryChange]) -> str:
         sum(kind in one for one in verdicts) for kind in ("lost", "gained", _CONFIDENT_WRONG)
     )
     name = f"{format_line(comparison.after).capitalize()}, compared with the {format_line(comparison.before)}"
-    queries = plural(comparison.queries, "query")
+    queries = format_count(comparison.queries, "query")
     if not verdicts:
         return f"{name}: none of {queries} lost or gained."
     parts = [f"{lost} lost" * bool(lost), f"{gained} gained" * bool(gained)]
     changed = ", ".join(part for part in parts if part) or "none lost or gained"
-    confident = f" {plural(wrong, 'wrong pose')} with a confidence above {SURE}." if wrong else ""
+    confident = f" {format_count(wrong, 'wrong pose')} with a confidence above {SURE}." if wrong else ""
     return f"{name}: of {queries} {changed}; {format_difference(comparison)}.{confident}"
 
 
@@ -165,7 +165,7 @@ def _table(found: Sequence[QueryChange]) -> str:
         for one in found[:_MAX_ROWS]
     ]
     omitted = len(found) - _MAX_ROWS
-    note = f'<p class="note">{plural(omitted, "more query")} not listed.</p>' if omitted > 0 else ""
+    note = f'<p class="note">{format_count(omitted, "more query")} not listed.</p>' if omitted > 0 else ""
     return table_html(_HEADS, lines) + note
 
 

@@ -17,16 +17,16 @@ _MARKED = ' class="marked"'
 _FILTER_ROWS = 12  # tables with more rows get a filter
 
 
-def plural(count: int, noun: str) -> str:
-    """A count and its noun, in the plural where the count is not 1."""
+def format_count(count: int, noun: str) -> str:
+    """A count and its noun, in the format_count where the count is not 1."""
     nouns = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
     return f"{format_number(count)} {noun if count == 1 else nouns}"
 
 
 def format_map(map: Map) -> str:
     """Number of images and points of a map."""
-    points = plural(len(map.point3D_ids), "point")
-    return points if map.is_for_direct_matching else f"{plural(len(map.images), 'image')}, {points}"
+    points = format_count(len(map.point3D_ids), "point")
+    return points if map.is_for_direct_matching else f"{format_count(len(map.images), 'image')}, {points}"
 
 
 def format_line(key: MeasurementKey, methods: Sequence[str] = ()) -> str:
@@ -68,9 +68,9 @@ def format_dominating_set(mapped: MappedObject) -> str:
     proof = "no smaller set can" if mapped.lower_bound >= count else f"at least {mapped.lower_bound} must"
     verb = "dominates" if count == 1 else "dominate"
     return (
-        f"{format_number(count)} of {plural(mapped.references, 'image')} {verb} the others ({proof}) and "
-        f"{'sees' if count == 1 else 'see'} {format_number(mapped.dominating_points)} of "
-        f"{plural(mapped.points, 'point')}."
+        f"{format_number(count)} of {format_count(mapped.references, 'image')} {verb} the others ({proof}) "
+        f"and {'sees' if count == 1 else 'see'} {format_number(mapped.dominating_points)} of "
+        f"{format_count(mapped.points, 'point')}."
     )
 
 

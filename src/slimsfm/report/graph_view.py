@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from slimsfm.arrays import Image
 from slimsfm.graph import ReferenceGraph
 from slimsfm.report.figures import CHOSEN, DROPPED, INK, new_figure, styled
-from slimsfm.report.formatting import format_error, plural
+from slimsfm.report.formatting import format_count, format_error
 from slimsfm.report.frames import photo_uri
 
 _WIDTH, _HEIGHT = 1000.0, 750.0  # nodes get the shape of most photos
@@ -99,15 +99,15 @@ def graph_html(drawing: GraphDrawing, photos: Path, photo_px: int) -> str:
     missing = "" if "<image" in nodes else "The photos are not available anymore. "
     count, edges = len(drawing.graph.names), drawing.graph.num_edges(drawing.threshold)
     return f"""<div class="graph">
-<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" aria-label="Reference graph of {plural(count, "image")}">
+<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" aria-label="Reference graph of {format_count(count, "image")}">
 <g class="edges">
 {_edges(drawing, places)}
 </g>
 {nodes}
 </svg>
 <div class="details" aria-live="polite"><img alt="" hidden><p>{missing}{_LEGEND}</p>
-<p>{plural(count, "image")}, {plural(edges, "edge")}. Point at a photo, tap it, or move with the arrow
-keys.</p></div>
+<p>{format_count(count, "image")}, {format_count(edges, "edge")}. Point at a photo, tap it, or move with the
+arrow keys.</p></div>
 </div>"""
 
 
@@ -137,7 +137,7 @@ def _descriptions(drawing: GraphDrawing) -> list[str]:
     descriptions = []
     for i, name in enumerate(graph.names):
         error = drawing.errors[best[i], i]
-        degrees = f"localizes {plural(out_degrees[i], 'other')}, is localized by {in_degrees[i]}. "
+        degrees = f"localizes {format_count(out_degrees[i], 'other')}, is localized by {in_degrees[i]}. "
         if name in drawing.chosen:
             descriptions.append(f"{degrees}In the dominating set.")
         elif error < drawing.threshold:

@@ -15,11 +15,11 @@ from slimsfm.report.formatting import (
     NO_VALUE,
     ColumnHead,
     NumberCell,
+    format_count,
     format_difference,
     format_gain,
     format_line,
     format_ratio,
-    plural,
     rows_html,
     table_html,
 )
@@ -59,7 +59,7 @@ def overview_html(data: ReportData, anchors: Mapping[str, str]) -> str:
 def _headline(data: ReportData, lines: Sequence[Comparison]) -> str:
     objects = data.run.objects
     queries = sum(len(one.queries) for one in objects)
-    counts = f"{plural(len(objects), 'object')}, {plural(queries, 'query')}"
+    counts = f"{format_count(len(objects), 'object')}, {format_count(queries, 'query')}"
     if not lines:
         return f"{counts}: only the full map was measured, so there is nothing to compare."
     first, *others = lines
@@ -73,7 +73,7 @@ def _failed(data: ReportData) -> str:
     if not data.run.failed:
         return ""
     items = "".join(f"<li><b>{escape(name)}</b>: {escape(why)}</li>" for name, why in data.run.failed.items())
-    count = plural(len(data.run.failed), "object")
+    count = format_count(len(data.run.failed), "object")
     return f'<section class="card failed"><h2>{count} could not be measured</h2><ul>{items}</ul></section>'
 
 
@@ -119,7 +119,7 @@ def _milliseconds(row: Row) -> str:
 def _dominating(data: ReportData, line: Comparison) -> tuple[str, str]:
     summary = next(one for one in summarize_domination(data.run.objects) if one.method == line.after[0])
     if summary.smallest == summary.largest:
-        counts = plural(summary.largest, "image") + " per object" * (summary.objects > 1)
+        counts = format_count(summary.largest, "image") + " per object" * (summary.objects > 1)
     else:
         counts = f"{summary.mean:.1f} images on average, {summary.smallest} to {summary.largest}"
     return (

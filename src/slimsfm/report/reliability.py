@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from slimsfm.evaluation.results import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.report.figures import COLORS, INK, new_figure, styled
-from slimsfm.report.formatting import plural
+from slimsfm.report.formatting import format_count
 
 _BINS = 10  # of equal width from 0 to 1; the last one includes 1
 _Z = 1.959963984540054  # of 95 %
@@ -104,8 +104,8 @@ def reliability_chart(outcomes: Outcomes) -> Figure:
         shares, counts = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
         _draw_shares(shares, found)
         _draw_counts(counts, found)
-        without = f", {plural(found.without, 'query')} without" if found.without else ""
-        lines = [plural(found.poses, "pose") + without]
+        without = f", {format_count(found.without, 'query')} without" if found.without else ""
+        lines = [format_count(found.poses, "pose") + without]
         if found.poses:
             lines += [f"expected calibration error {found.expected_error:.3f}"]
             lines += [f"Brier score {found.brier:.3f}"]

@@ -15,7 +15,7 @@ from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.evaluation.results import Outcomes
 from slimsfm.geometry import ADD_FRACTIONS, Box
 from slimsfm.report.figures import CHOSEN, DROPPED, INK, RIGHT_COLOR, new_figure, styled
-from slimsfm.report.formatting import plural
+from slimsfm.report.formatting import format_count
 from slimsfm.report.scene3d import view_frame
 
 Verdict = Literal["right", "wrong", "not localized"]
@@ -85,7 +85,7 @@ def sphere_chart(
             _draw_references(axes, projection.apply(seen), used)
             _draw_queries(axes, projection.apply(asked), found)
             counts = ", ".join(f"{list(found).count(verdict)} {verdict}" for verdict in _LOOKS)
-            title = f"{name}: {plural(int(used.sum()), 'image')}\nqueries: {counts}"
+            title = f"{name}: {format_count(int(used.sum()), 'image')}\nqueries: {counts}"
             axes.set_title(title, fontweight="normal")
         figure.legend(handles=_legend(), loc="outside lower center", ncols=5)
     return figure

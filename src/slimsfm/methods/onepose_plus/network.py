@@ -218,7 +218,7 @@ WINDOW = 5  # fine cells along a side of the window in which a match is refined
 STRIDE = 4  # fine cells along a side of a cell
 
 
-class CellMatches(NamedTuple):
+class PointCellMatches(NamedTuple):
     """Points of a map and the matching cells of an image, sorted by point."""
 
     batches: Int64[Tensor, " k"]
@@ -254,7 +254,7 @@ def dual_softmax(
 
 def mutual_matches(
     confidence: Float[Tensor, "b m s"], grid: tuple[int, int], threshold: float
-) -> CellMatches:
+) -> PointCellMatches:
     """Find points and cells that are mutual nearest neighbors above a confidence threshold.
 
     Args:
@@ -266,7 +266,7 @@ def mutual_matches(
     is_mutual = confidence.amax(dim=1).gather(1, cells) == best
     is_good = is_mutual & (best > threshold) & _inside(grid, confidence.device)[cells]
     batches, points = torch.nonzero(is_good, as_tuple=True)
-    return CellMatches(batches, points, cells[batches, points], best[batches, points])
+    return PointCellMatches(batches, points, cells[batches, points], best[batches, points])
 
 
 def _inside(grid: tuple[int, int], device: torch.device) -> Bool[Tensor, " s"]:
@@ -276,7 +276,9 @@ def _inside(grid: tuple[int, int], device: torch.device) -> Bool[Tensor, " s"]:
     return inside.flatten()
 
 
-def windows(fine: Float[Tensor, "b f h4 w4"], matches: CellMatches, columns: int) -> Float[Tensor, "k ww f"]:
+def windows(
+    fine: Float[Tensor, "b f h4 w4"], matches: PointCellMatches, columns: int
+) -> Float[Tensor, "k ww f"]:
     """Fine features around the center of matched cells, row by row; zeros beyond the border.
 
     Args:
@@ -386,7 +388,7 @@ class OnePosePlusMatcher(nn.Module):
         self,
         fine: Float[Tensor, "b f h4 w4"],
         fine_descriptors: Float[Tensor, "b f m"],
-        found: CellMatches,
+        found: PointCellMatches,
         columns: int,
     ) -> Float[Tensor, "k 2"]:
         """Refined pixels of the matched points."""
