@@ -1,4 +1,4 @@
-"""Options of commands: where the work runs."""
+"""Arguments that commands share: where work and networks run, sizes and percentages."""
 
 import re
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What `reduce` and `frontier` share: the kept reference graph, sentences and tables."""
+"""What commands print in tables: choices of `reduce` and `frontier`, results of `benchmark`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The interface of data sets: objects, each with images for mapping and images to localize."""
+"""The interface of data sets: objects with images to map and to localize, and models of objects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

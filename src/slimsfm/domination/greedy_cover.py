@@ -1,4 +1,4 @@
-"""The greedy solver and the order of all nodes, both built with the lazy greedy rule."""
+"""Lazy greedy domination, the order of all nodes, and the random draws of the paper."""
 
 from collections.abc import Iterable, Iterator
 from heapq import heapify, heappop, heapreplace

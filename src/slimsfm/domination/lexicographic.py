@@ -1,4 +1,4 @@
-"""Lexicographic minimization by integer programs: one objective after the other, per component."""
+"""Integer programs of domination, and lexicographic minimization: one objective after the other."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The minimum dominating set problem: its statement and its checkers."""
+"""The minimum dominating set problem: its statement, the checks of its input, and solutions."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What a benchmark measures: outcomes of queries, maps of each object, one measurement per table row."""
+"""Outcomes of queries, how queries are localized and judged, and measurements per table row."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

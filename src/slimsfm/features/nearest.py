@@ -1,4 +1,4 @@
-"""Matching by descriptor distance: mutual nearest neighbors that pass Lowe's ratio test."""
+"""Mutual nearest neighbors that pass the ratio test, and global descriptors (VLAD)."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""The edge sources: stored matches, common points, localizing again, and a mix of these.
+"""Options of the reference graph, pairs of images worth trying, and the sources of edges.
 
 References:
     [1] Joseph, Amrutur and Bhatnagar, Accelerating SfM-based Pose Estimation with Dominating Set, 2025.

@@ -1,4 +1,4 @@
-"""Localize all images of a folder, on several threads."""
+"""Localize images against several maps, and all images of a folder on several threads."""
 
 from collections.abc import Mapping
 from dataclasses import replace

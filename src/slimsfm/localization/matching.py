@@ -1,4 +1,4 @@
-"""Match a query with one reference image: by nearest descriptors, by a network, or without keypoints."""
+"""Match a query with one reference image, or with points near where they project."""
 
 from dataclasses import replace
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""Match the query against reference images: against all of them, or against those most similar to it [1].
+"""The strategies: direct, exhaustive, retrieval as in hierarchical localization [1], and progressive.
 
 References:
     [1] Sarlin, Cadena, Siegwart and Dymczyk, From Coarse to Fine: Robust Hierarchical Localization at Large

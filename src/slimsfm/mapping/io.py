@@ -1,4 +1,4 @@
-"""Maps on disk.
+"""Maps on disk, and the photos of maps without keypoints.
 
 MAP/
   sparse/       COLMAP model, opens in COLMAP, pycolmap and hloc

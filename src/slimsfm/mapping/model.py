@@ -1,4 +1,4 @@
-"""Read COLMAP models and check them.
+"""Read COLMAP models and check them; read or estimate the box of the object.
 
 pycolmap trusts the counts in a binary file: a truncated file makes it run out of memory or abort the process.
 So each binary file is first walked record by record, as COLMAP's "Output Format" describes. Damage that

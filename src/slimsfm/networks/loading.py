@@ -1,4 +1,4 @@
-"""Loading weights into networks: every value with the right name and shape, or nothing."""
+"""The device of a network, and loading its weights: every value with the right name and shape."""
 
 import pickle
 from collections.abc import Callable, Collection, Mapping

@@ -1,4 +1,4 @@
-"""One way to make a map small: what it keeps, its size, and how it is predicted to localize."""
+"""Choices of what to keep, what each is predicted to do, and the limits by which one is recommended."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

@@ -147,7 +147,7 @@ def _summary(comparison: Comparison, found: Sequence[QueryChange]) -> str:
 _HEADS = (
     ColumnHead("Object", "name of the object", is_number=False),
     ColumnHead("Map", "reduced map and strategy", is_number=False),
-    ColumnHead("PosedQuery", "image file", is_number=False),
+    ColumnHead("Query", "image file", is_number=False),
     ColumnHead("Outcome", "lost: right with the full map only; gained: vice versa", is_number=False),
     ColumnHead("Error before", "relative to the object, with the full map"),
     ColumnHead("Confidence before", "estimated probability that the pose is right, with the full map"),

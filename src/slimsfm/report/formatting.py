@@ -110,7 +110,7 @@ class NumberCell:
 
 
 NO_VALUE = NumberCell("\N{EN DASH}", None)
-"""Measurement without a value."""
+"""Cell without a value."""
 
 
 def table_html(

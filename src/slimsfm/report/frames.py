@@ -1,4 +1,4 @@
-"""PosedQuery images with the estimated and the true box drawn in, and JPEGs embedded in the page."""
+"""Query images and videos with the object's box drawn in, and JPEGs embedded in the page."""
 
 import base64
 import io

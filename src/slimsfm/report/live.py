@@ -202,7 +202,7 @@ class LiveView:
 
         Args:
             name: Name of the image.
-            shown: MeasurementKey of the map.
+            shown: Key of the map.
 
         Raises:
             SlimsfmError: The image cannot be read, or its focal length is unknown.

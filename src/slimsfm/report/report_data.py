@@ -37,7 +37,7 @@ class ReportData:
 
     @property
     def overall(self) -> str:
-        """MeasurementKey of the rows and comparisons of the whole run."""
+        """Key of the rows and comparisons of the whole run."""
         names = [one.name for one in self.run.objects]
         return BY_FRAME if len(names) > 1 else names[0]
 

@@ -1,4 +1,4 @@
-"""The selection problem: which of many 3D points keep the poses of all images well determined."""
+"""The selection problem, which of many 3D points keep poses well determined, and lazy greedy selection."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The default selector: K-cover that weights each use of a point by its information on the image's pose.
+"""The selectors: pose information, K-cover and random points.
 
 A use of a point by an image, with twist J, adds the information J'J to the image's pose. Its value is 1 + w
 log det(I + J C J'), where C is the covariance of the pose given the points chosen so far: one more match for

@@ -1,4 +1,4 @@
-"""The selection problem of a map: which images can use which points, and their information on the pose.
+"""Leaving images out of a map, and which images can use which points.
 
 An image can use a point if a query that looks like the image would match it correctly. This is tested: the
 image's own descriptors are removed from the points it sees, its keypoints are matched against the points near

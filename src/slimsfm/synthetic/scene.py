@@ -1,4 +1,4 @@
-"""Two takes of an object: a tidy one for mapping, and one with clutter for queries."""
+"""Camera paths around an object, and two takes: a tidy one to map, one with clutter for queries."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

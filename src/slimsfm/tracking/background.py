@@ -1,4 +1,4 @@
-"""Localization in the background of tracking: it finds points that come into sight and verifies the track.
+"""What runs besides tracking: localization in the background, and finding a lost object again.
 
 A frame is handed to another thread, and its result is used a fixed number of frames later: later than
 necessary on a fast machine, after waiting on a slow one. So the poses depend on the frames alone.

@@ -1,4 +1,4 @@
-"""Templates: small images of map points, and the search for them in later frames.
+"""Gray frames and optical flow; templates, small images of points, and the search for them in later frames.
 
 A template is cut out around the pixel that its point was matched with, and stores what one step of its pixels
 is in the world. So it can be drawn as the camera should see it from any later pose: scaled, rotated and

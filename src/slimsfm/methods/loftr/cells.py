@@ -1,4 +1,4 @@
-"""Keypoints without a detector: the cells of an image that match a cell of any other image [1].
+"""What matching without keypoints takes and gives, and cells of an image as its keypoints [1].
 
 References:
     [1] He, Sun, Wang, Huang, Bao and Zhou, OnePose++: Keypoint-Free One-Shot Object Pose Estimation

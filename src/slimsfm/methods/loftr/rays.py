@@ -1,4 +1,4 @@
-"""Points on known rays: their depths by least squares over the reprojection errors.
+"""Tracks of a model, and their points on known rays: depths by least squares.
 
 A point on the ray of one of its observations has one unknown, its depth. So the normal equations of all
 points are diagonal, and Levenberg-Marquardt runs for all points at once, each with its own damping.
