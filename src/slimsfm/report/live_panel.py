@@ -212,7 +212,7 @@ class QueryControls:
         self._view, self._viewer, self._queries = view, viewer, view.queries
         self._frusta: dict[str, viser.CameraFrustumHandle] = {}
         gui = viewer.client.gui
-        with gui.add_folder("PosedQuery"):
+        with gui.add_folder("Query"):
             self.names = gui.add_dropdown("Image", self._queries.names)
             self.preview = gui.add_image(_NO_IMAGE)
             self.button = gui.add_button("Localize", color=QUERY_RGB)
