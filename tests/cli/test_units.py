@@ -2,7 +2,7 @@
 
 import pytest
 
-from slimsfm.cli.arguments import parse_bytes, parse_percent
+from slimsfm.cli.reduce_command import parse_bytes, parse_percent
 from slimsfm.errors import InputError
 
 
