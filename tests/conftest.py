@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from scenes import exact_map, with_matches
 from slimsfm.mapping.map import Map
-from slimsfm.weights import chosen_runtime, use_runtime
+from slimsfm.weights import use_runtime
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores: threads of each would collide
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -19,8 +19,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores:
 
 @pytest.fixture(autouse=True)
 def restored_runtime() -> Iterator[None]:
-    """Undo what a command does that a test runs in this process: its runtime ends with the test."""
-    with use_runtime(chosen_runtime()):
+    """Start each test without a runtime: a command that ran in this process may have left one."""
+    with use_runtime(None):
         yield
 
 
