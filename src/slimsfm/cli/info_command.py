@@ -3,7 +3,7 @@
 import json as json_format
 
 from slimsfm.cli.options import MapPath
-from slimsfm.cli.output import console, counts, plural, size
+from slimsfm.cli.output import console, counts, plural, print_notes, size
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
 
@@ -22,6 +22,7 @@ def info(map: MapPath, /, json: bool = False, images: bool = False) -> None:
         return
     for name, text in _lines(map_, sizes).items():
         console.print(f"{name:<14}{text}", markup=False)
+    print_notes(map_)
     if images:
         console.print(f"{'image names':<14}{', '.join(map_.images)}", markup=False)
 
@@ -40,6 +41,7 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         "unit": map.info.unit,
         "extractor": {"name": map.info.extractor, "options": map.info.extractor_options},
         "origin": map.info.origin,
+        "notes": list(map.info.notes),
         "bytes": sizes,
     }
 

@@ -88,7 +88,14 @@ def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:
         console.print("next: slimsfm " + " ".join(str(word) for word in next_command), style="bold")
 
 
+def print_notes(map: Map) -> None:
+    """Print what was skipped, ignored or guessed when a map was made."""
+    for note in map.info.notes:
+        console.print(f"note: {note}", style="yellow", markup=False)
+
+
 def finish_map(made: Map, output: Path, watch: Stopwatch) -> None:
     """Print what a new map contains and how long it took, and how to reduce it."""
+    print_notes(made)
     parts = ", ".join(plural(number, name.removesuffix("s")) for name, number in counts(made).items())
     finish(f"{output}: {parts}", watch, "reduce", output, "-o", f"{output}-small")

@@ -210,6 +210,7 @@ def _info_to_json(info: MapInfo) -> dict:
         },
         "unit": info.unit,
         "origin": info.origin,
+        "notes": list(info.notes),
     }
 
 
@@ -234,6 +235,7 @@ def _read_info(path: Path) -> MapInfo:
             box_source=data["box"]["source"],
             unit=data["unit"],
             origin=data["origin"],
+            notes=tuple(data.get("notes", ())),
         )
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error

@@ -42,6 +42,9 @@ class MapInfo:
     origin: str
     """A sentence that says how the map was made."""
 
+    notes: tuple[str, ...] = ()
+    """Sentences, with names, on what was skipped, ignored or guessed when the map was made."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observations:
