@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pycolmap
-from threadpoolctl import threadpool_limits
+
+from slimsfm.mapping.sfm import adjust
 
 _ITERATIONS = 10  # of bundle adjustment; enough to see where focal lengths go
 _OFF = 0.15  # of the logarithm of a focal length from the median: another focal length
@@ -24,11 +25,8 @@ def has_several_focal_lengths(model: pycolmap.Reconstruction) -> bool:
         return False
     apart = with_own_cameras(model)
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
     options.ceres.solver_options.max_num_iterations = _ITERATIONS
-    options.ceres.solver_options.num_threads = 1
-    with threadpool_limits(1):
-        pycolmap.bundle_adjustment(apart, options)
+    adjust(apart, options)
     for image_ids in shared.values():
         logs = np.log([max(apart.camera(i).mean_focal_length(), 1e-9) for i in image_ids])
         off = int((np.abs(logs - np.median(logs)) > _OFF).sum())

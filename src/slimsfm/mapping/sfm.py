@@ -298,6 +298,18 @@ def _name_images(model: pycolmap.Reconstruction, names: list[str]) -> None:
         image.name = names[image_id - 1]
 
 
+def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Adjust all poses, points and cameras of a model on one thread, without a word."""
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    with threadpool_limits(1):  # results must not depend on the number of threads
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
 def triangulate(
     database: Path,
     names: list[str],

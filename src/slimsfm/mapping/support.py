@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slimsfm.arrays import IndexPairs, Points2D
+from slimsfm.arrays import Points2D
 from slimsfm.mapping.model import camera_of
 from slimsfm.mapping.pairs import Matches, in_order
 from slimsfm.mapping.quality import MIN_COMMON_POINTS, ModelQuality
@@ -82,11 +82,13 @@ def agreement(images: Mapping[str, pycolmap.Image], matches: Matches) -> dict[Pa
     Images of more than 1600 px may err by proportionally more.
     """
     rays = {name: _rays(image) for name, image in images.items()}
-    return {
-        (a, b): float(_agrees(images[a], images[b], rays[a], rays[b], matches[a, b]).mean())
-        for a, b in matches
-        if a in images and b in images and len(matches[a, b])
-    }
+    found = {}
+    for a, b in matches:
+        rows = matches[a, b]
+        if a in images and b in images and len(rows):
+            matched = rays[a][rows[:, 0]], rays[b][rows[:, 1]]
+            found[a, b] = float(_agrees(images[a], images[b], *matched).mean())
+    return found
 
 
 def _rays(image: pycolmap.Image) -> Points2D:
@@ -95,10 +97,10 @@ def _rays(image: pycolmap.Image) -> Points2D:
 
 
 def _agrees(
-    a: pycolmap.Image, b: pycolmap.Image, rays_a: Points2D, rays_b: Points2D, pairs: IndexPairs
+    a: pycolmap.Image, b: pycolmap.Image, rays_a: Points2D, rays_b: Points2D
 ) -> Bool[np.ndarray, " n"]:
     essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
-    squared = pycolmap.compute_squared_sampson_error(rays_a[pairs[:, 0]], rays_b[pairs[:, 1]], essential)
+    squared = pycolmap.compute_squared_sampson_error(rays_a, rays_b, essential)
     cameras = camera_of(a), camera_of(b)
     allowed = max(_MAX_ERROR_PX * _scale(camera) / camera.mean_focal_length() for camera in cameras)
     return np.asarray(squared) < allowed**2

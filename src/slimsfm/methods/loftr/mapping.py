@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
-from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
 from slimsfm.mapping.extraction import color_points, mask_of
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
 from slimsfm.mapping.reconstruction import pick_model, reconstruct
-from slimsfm.mapping.sfm import triangulate, verified_matches, write_database
+from slimsfm.mapping.sfm import adjust, triangulate, verified_matches, write_database
 from slimsfm.methods.loftr.cells import (
     CellKeypoints,
     EncodedImage,
@@ -318,9 +317,9 @@ def _enlarge(
     exact: bool,
 ) -> None:
     """Scale a model from small images to the photos; with `exact`, it gets the given cameras unchanged."""
-    names = {cameras[name].camera_id: name for name in factors}
-    for camera_id, camera in model.cameras.items():
-        name = names[camera_id]
+    names = {image.camera_id: image.name for image in model.images.values()}
+    for camera_id, name in sorted(names.items()):
+        camera = model.camera(camera_id)
         whole = cameras[name] if exact else _scaled(camera, factors[name])
         camera.params = whole.params.tolist()
         camera.width, camera.height = cameras[name].width, cameras[name].height
@@ -333,9 +332,6 @@ def _enlarge(
 def _adjust(model: pycolmap.Reconstruction) -> None:
     """Adjust poses and focal lengths, which were estimated from the less exact cells."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.solver_options.num_threads = 1
-    with threadpool_limits(1):  # results must not depend on the number of threads
-        pycolmap.bundle_adjustment(model, options)
+    adjust(model, options)
     model.update_point_3d_errors()
