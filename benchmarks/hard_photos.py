@@ -1,6 +1,6 @@
 """Folders of photos as people bring them, made from good ones: mixtures, brackets, blur, zooms, panoramas.
 
-Each maker takes a folder of photos of one place and one of another place, and writes photos to a third folder.
+Each maker takes a folder of photos of one place and one of another place, and yields photos with their names.
 """
 
 from collections.abc import Callable, Iterable

@@ -6,7 +6,7 @@ MIN_COMMON_POINTS = 15
 """Points that two images must both see to be joined."""
 
 _MIN_FOCAL, _MAX_FOCAL = 0.2, 15.0  # focal length over the longer side of the image
-_FLAT_ANGLE_DEG, _FLAT_SPREAD = 5.0, 0.1  # of a camera that turns without moving
+_WITHOUT_PARALLAX = 0.8  # share of the pairs of a camera that only turned
 _LISTED = 12  # names in a sentence
 
 
@@ -47,6 +47,9 @@ class ModelQuality:
     camera_spread: float
     """Largest distance of a camera to the median camera, over the median distance from cameras to points."""
 
+    without_parallax: float = 0.0
+    """Share of the pairs whose matches a rotation of the camera explains; measured if cameras are close."""
+
     focal_lengths: dict[str, float] = field(default_factory=dict)
     """Focal length over the longer side, by the name of the first image of each camera."""
 
@@ -70,11 +73,10 @@ class ModelQuality:
                 f"its images fall into {len(self.pieces)} pieces of {', '.join(map(str, self.pieces[:5]))} "
                 f"images, with fewer than {MIN_COMMON_POINTS} common points between them"
             )
-        if self.triangulation_angle_deg < _FLAT_ANGLE_DEG and self.camera_spread < _FLAT_SPREAD:
-            angle, spread = self.triangulation_angle_deg, self.camera_spread
+        if self.without_parallax >= _WITHOUT_PARALLAX:
             found.append(
-                f"the camera turned but hardly moved (points are seen under {angle:.1f} degrees, cameras are "
-                f"spread over {spread:.0%} of the distance to them); walk around while taking photos"
+                f"the camera turned but hardly moved (rotations explain {self.without_parallax:.0%} of the "
+                "pairs of photos); walk around while taking photos"
             )
         for name, focal in self.focal_lengths.items():
             if not _MIN_FOCAL <= focal <= _MAX_FOCAL:

@@ -7,7 +7,7 @@ contradict matches that are hard to doubt. Three measures tell them apart:
     contradictions  of the trusted pairs of images, those of which fewer than half of the matches lie within
                     4 px of their epipolar lines
     pieces          images joined by at least 15 common points, directly or through others
-    parallax        the angle under which cameras see a point, and how far the cameras are apart
+    parallax        whether rotations of the camera explain the matches as well (`mapping.parallax`)
 
 The trusted pairs of an image are those with its neighbors in order of name, if they have at least half as
 many matches as its strongest pair; otherwise its strongest pair. What was photographed one after the other
@@ -28,6 +28,7 @@ from scipy.sparse.csgraph import connected_components
 from slimsfm.arrays import Points2D
 from slimsfm.mapping.model import camera_of
 from slimsfm.mapping.pairs import Matches, in_order
+from slimsfm.mapping.parallax import share_without_parallax
 from slimsfm.mapping.quality import MIN_COMMON_POINTS, ModelQuality
 
 Pair = tuple[str, str]
@@ -37,6 +38,7 @@ MIN_AGREEING = 0.5
 
 _MAX_ERROR_PX, _FULL_SIZE = 4.0, 1600  # from an epipolar line; in larger images in proportion
 _NEIGHBOR_SHARE = 0.5  # of the matches of the strongest pair that a neighbor needs to be trusted
+_CLOSE = 0.3  # camera spread up to which cameras may only have turned
 _SAMPLED = 2000  # points whose triangulation angle is measured
 
 
@@ -59,6 +61,7 @@ def measure(model: pycolmap.Reconstruction, matches: Matches, names: Iterable[st
     }
     observations = [image.num_points3D for image in images.values()]
     lengths = [point.track.length() for point in model.points3D.values()]
+    spread = _camera_spread(model)
     return ModelQuality(
         given=len(names),
         registered=len(images),
@@ -70,7 +73,8 @@ def measure(model: pycolmap.Reconstruction, matches: Matches, names: Iterable[st
         median_observations=float(np.median(observations or [0])),
         median_track_length=float(np.median(lengths or [0])),
         triangulation_angle_deg=_triangulation_angle(model),
-        camera_spread=_camera_spread(model),
+        camera_spread=spread,
+        without_parallax=share_without_parallax(images, matches) if spread < _CLOSE else 0.0,
         focal_lengths=_focal_lengths(images),
         pieces=_pieces(common),
     )
