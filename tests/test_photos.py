@@ -3,7 +3,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.photos import camera_from_exif, list_images, read_image, read_mask, shrink
+from slimsfm.image_files import list_images
+from slimsfm.photos import camera_from_exif, read_image, read_mask, shrink
 
 UPRIGHT = np.zeros((4, 6, 3), np.uint8)
 UPRIGHT[0, 0], UPRIGHT[0, -1], UPRIGHT[-1, 0], UPRIGHT[-1, -1] = (
