@@ -177,7 +177,7 @@ def _files(folder: Path, leave_out: Path | None, skipped: dict[str, list[str]]) 
 
 
 def _walk(folder: Path, leave_out: Path | None, skipped: dict[str, list[str]]) -> Iterator[Path]:
-    """All files below a folder that are not hidden; linked folders last, so that they cannot form a circle."""
+    """All files below a folder that are not hidden; linked folders last, so that no circle is walked."""
     left_out = os.path.realpath(leave_out) if leave_out else ""
     entered, linked = set(), [folder]
     for start in linked:  # grows

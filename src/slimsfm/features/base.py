@@ -1,5 +1,6 @@
 """Local features, and the protocols of extractors and matchers."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -95,6 +96,20 @@ class Matcher(Protocol):
     def match(self, features1: Features, features2: Features) -> IndexPairs:
         """Match two images. Each feature occurs at most once; pairs are sorted by the first feature."""
         ...
+
+
+def shrink_factor(extractor_options: Mapping, width: int, height: int) -> float:
+    """Pixels of an image per pixel in which its features are found; 1 unless its extractor shrinks it.
+
+    Errors of keypoints grow with this factor, so limits in pixels are multiplied by it.
+
+    Args:
+        extractor_options: The extractor's `options`; without `max_image_size`, it shrinks nothing.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
+    """
+    largest = extractor_options.get("max_image_size")
+    return max(1.0, max(width, height) / largest) if largest else 1.0
 
 
 def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:

@@ -1,7 +1,7 @@
 """Localize a query image against one map."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -9,6 +9,7 @@ import pycolmap
 
 from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.features import Features, load_extractor, unit_rows
+from slimsfm.features.base import shrink_factor
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.matching import extract_near
@@ -204,8 +205,9 @@ class Localizer:
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        features = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
-        seconds, query = perf_counter() - start, self._query(features, camera, image)
+        found = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
+        seconds, query = perf_counter() - start, self._query(found.features, camera, image)
+        query = replace(query, shrink_factor=found.shrink_factor)
         return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 
     @property
@@ -259,6 +261,7 @@ class Localizer:
             features=features,
             camera=camera,
             image=image,
+            shrink_factor=shrink_factor(self.extractor.options, camera.width, camera.height),
         )
 
     def camera_of(self, image: Image, given: pycolmap.Camera | None = None) -> pycolmap.Camera:

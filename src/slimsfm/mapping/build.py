@@ -12,7 +12,6 @@ import pycolmap
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
-from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.image_files import find_images
 from slimsfm.mapping.descriptors import with_global_descriptors
@@ -24,12 +23,12 @@ from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs
 from slimsfm.mapping.sfm import (
     colmap_warnings,
     match_pairs,
-    put_keypoints,
     reconstruct,
     triangulate,
     verified_matches,
     write_database,
 )
+from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -253,14 +252,15 @@ class ModelBuilder(Protocol):
 def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
     features, colors = extract_features(work.photos, names, extractor, output, work.progress)
-    database, sfm = _match(work, features, options), work.workspace / "sfm"
+    shrunk = ShrunkImages.by_extractor(features, work.cameras, extractor.options)
+    database, sfm = _match(work, shrunk, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
     if work.known:
         poses = work.known.cam_from_world
         model = triangulate(database, names, sfm, poses, seed=seed, progress=progress)
     else:
         model = reconstruct(database, names, sfm, seed=seed, progress=progress)
-    put_keypoints(model, features)
+    shrunk.enlarge(model, known_cameras=work.known is not None)
     color_points(model, colors)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     return MapParts(extractor=extractor, model=model, features=features, matches=matches)
@@ -273,9 +273,9 @@ def _extractor(options: BuildOptions) -> Extractor:
     )
 
 
-def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Path:
-    database = work.workspace / "database.db"
-    write_database(database, features, work.cameras)
+def _match(work: BuildWork, shrunk: ShrunkImages, options: BuildOptions) -> Path:
+    database, features = work.workspace / "database.db", shrunk.whole
+    write_database(database, shrunk.features, shrunk.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
         match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)

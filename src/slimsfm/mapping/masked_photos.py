@@ -84,8 +84,8 @@ class MaskedPhotos:
         empty = self._said[_EMPTY]
         if len(self._names) - len(empty) < 2 <= len(self._names):
             raise InputError(
-                f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask they "
-                "are white, or have any other value but 0, and in a photo they are not transparent"
+                f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask "
+                "they are white, or have any other value but 0, and in a photo they are not transparent"
             )
 
     @property
@@ -144,6 +144,6 @@ def _no_mask(masks: Path, name: str) -> str:
         held = "no image"
     stem = PurePosixPath(name).with_suffix(".png")
     return (
-        f"{masks}: holds no mask of any photo, {held}; the mask of {name} is named {name}.png or {stem}, in the "
-        "same subfolder as the photo"
+        f"{masks}: holds no mask of any photo, {held}; the mask of {name} is named {name}.png or {stem}, in "
+        "the same subfolder as the photo"
     )
