@@ -6,6 +6,7 @@ are from 0 (black) to 1 (white) unless one is larger, and then count as integers
 that are no number are black.
 """
 
+import logging
 import re
 import warnings
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError
 from slimsfm.image_files import INSTALL_HEIC, can_read_heic
 
+_LOGGER = logging.getLogger(__name__)
 _UNREADABLE = (UnidentifiedImageError, OSError, EOFError, ValueError, SyntaxError, RuntimeError)
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _GUESS = 1.2  # focal length over the longer side, as COLMAP guesses it
@@ -40,7 +42,7 @@ class Photo:
     """RGB."""
 
     alpha: GrayImage | None
-    """0 where the image is fully transparent; None if it is opaque everywhere."""
+    """0 where the image is fully transparent, 255 elsewhere; None if it is nowhere."""
 
     orientation: int
     """EXIF orientation that the stored pixels were turned by; 1 if not at all."""
@@ -49,20 +51,26 @@ class Photo:
     """Number of frames or pages in the file, of which this is the first."""
 
 
-def read_photo(path: str | Path) -> Photo:
+def read_photo(path: str | Path, *, warn: bool = True) -> Photo:
     """Read an image of any format, color mode and bit depth, turned upright by its EXIF orientation.
+
+    Args:
+        path: The file; of several frames or pages the first is read.
+        warn: Log a warning if there are several.
 
     Raises:
         ImageError: The file is missing, not a complete image, or too large.
     """
     stored = _read(path)
+    if warn and stored.num_frames > 1:
+        _LOGGER.warning("%s: the first of %d frames or pages is used", path, stored.num_frames)
     image = upright(_as_rgb(stored.values), stored.orientation)
     alpha = None if stored.alpha is None else upright(stored.alpha, stored.orientation)
     return Photo(image=image, alpha=alpha, orientation=stored.orientation, num_frames=stored.num_frames)
 
 
 def read_image(path: str | Path) -> Image:
-    """Read an image as upright RGB; transparency is ignored, and of several frames the first is read.
+    """Read an image as upright RGB like `read_photo`, without its transparency.
 
     Raises:
         ImageError: As in `read_photo`.
@@ -134,13 +142,15 @@ def _read(path: str | Path) -> _Stored:
         if values is None:
             values, alpha = _values(file)
         elif values.ndim == 3 and values.shape[2] == 4:
-            values, alpha = values[..., :3], np.where(values[..., 3], 255, 0).astype(np.uint8)
-        if alpha is not None and alpha.all():
-            alpha = None
+            values, alpha = values[..., :3], values[..., 3]
+        if alpha is not None:
+            alpha = None if alpha.all() else np.where(alpha, 255, 0).astype(np.uint8)
         return _Stored(values, alpha, orientation if orientation in range(1, 9) else 1, num_frames)
 
 
-def _values(file: PillowImage.Image) -> tuple[Shaped[np.ndarray, "_ _ *channels"], GrayImage | None]:
+def _values(
+    file: PillowImage.Image,
+) -> tuple[Shaped[np.ndarray, "_ _ *channels"], Shaped[np.ndarray, "_ _"] | None]:
     """Gray or RGB values and alpha as Pillow decodes them."""
     if file.mode.startswith(_WIDE):
         return np.array(file), None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int64, Shaped, UInt8
+from jaxtyping import Bool, Float, Float32, Int64, Shaped, UInt8
 
 from slimsfm.arrays import Descriptors, GrayImage, Image, IndexPairs
 
@@ -118,6 +118,14 @@ def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
     lengths = np.sqrt(np.einsum("nd,nd->n", rows, rows))
     rows /= np.maximum(lengths, np.float32(1e-12))[:, None]
     return rows
+
+
+def unmasked(keypoints: Float[np.ndarray, "n 2"], mask: GrayImage | None) -> Bool[np.ndarray, " n"]:
+    """Which keypoints lie on pixels of a mask that are not 0; all do if there is no mask."""
+    if mask is None:
+        return np.ones(len(keypoints), dtype=bool)
+    columns, rows = np.clip(keypoints.astype(np.int64), 0, np.array(mask.shape[::-1]) - 1).T
+    return mask[rows, columns] > 0
 
 
 def image_colors(

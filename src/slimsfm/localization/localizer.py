@@ -7,9 +7,8 @@ from time import perf_counter
 import numpy as np
 import pycolmap
 
-from slimsfm.arrays import Image, Points2D, Points3D
-from slimsfm.features import Features, load_extractor, unit_rows
-from slimsfm.features.base import shrink_factor
+from slimsfm.arrays import GrayImage, Image, Points2D, Points3D
+from slimsfm.features import Features, load_extractor, shrink_factor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.matching import extract_near
@@ -163,7 +162,11 @@ class Localizer:
         self._search = Search(map, self._strategy, options.ransac, options.focal)
 
     def localize(
-        self, image: Image, camera: pycolmap.Camera | None = None, gravity: Gravity | None = None
+        self,
+        image: Image,
+        camera: pycolmap.Camera | None = None,
+        gravity: Gravity | None = None,
+        mask: GrayImage | None = None,
     ) -> Localization:
         """Localize one image.
 
@@ -173,13 +176,14 @@ class Localizer:
                 images share one of the same aspect ratio. A guess suffices if the focal length is not known.
             gravity: Direction of gravity in the map and in the image, as a phone measures it; used only if
                 the focal length is known.
+            mask: Of the size of the image; features where it is 0 are not used.
 
         Raises:
             ValueError: The camera has another image size, or none is given and the map's does not fit.
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        features = self.extractor.extract(image)
+        features = self.extractor.extract(image, mask)
         seconds, query = perf_counter() - start, self._query(features, camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), seconds)
 

@@ -19,9 +19,9 @@ from slimsfm.features import (
     load_extractor,
     load_matcher,
     match_nearest,
+    shrink_factor,
     unit_rows,
 )
-from slimsfm.features.base import shrink_factor
 from slimsfm.geometry import Box, project
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target
 from slimsfm.mapping.map import Map

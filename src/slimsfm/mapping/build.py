@@ -13,11 +13,10 @@ from slimsfm.arrays import Image
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
 from slimsfm.geometry import Box
-from slimsfm.image_files import find_images
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
+from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos, find_photos
 from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.sfm import (
@@ -122,9 +121,14 @@ def build_map(
         ReconstructionError: The images give no model.
     """
     images = Path(images)
-    names, notes = _photos_of(images, options.masks, known)
+    if known:
+        names, notes = sorted(known.cam_from_world), ()
+    else:
+        found = find_photos(images, options.masks)
+        names, notes = list(found.names), found.notes
     if len(names) < 2:
-        raise InputError(f"{images}: holds {len(names)} image; a map needs at least two")
+        few = f"{images}: holds {len(names)} image; a map needs at least two"
+        raise InputError("; ".join([few, *notes]))
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
     photos = MaskedPhotos(images, names, options.masks, options.alpha)
@@ -165,17 +169,6 @@ def build_map(
         unregistered=tuple(name for name in names if name not in registered),
     )
     return with_global_descriptors(made)
-
-
-def _photos_of(
-    images: Path, masks: Path | None, known: KnownPoses | None
-) -> tuple[list[str], tuple[str, ...]]:
-    """Names of the photos to use, and notes on what is skipped; masks in a subfolder are no photos."""
-    if known:
-        return sorted(known.cam_from_world), ()
-    inside = masks is not None and Path(masks).resolve() != images.resolve()
-    found = find_images(images, leave_out=masks if inside else None)
-    return list(found.names), found.notes
 
 
 @contextmanager

@@ -13,8 +13,7 @@ from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, Image, IndexPairs, Mask, Points3D
 from slimsfm.errors import MapError
-from slimsfm.features import Features, NearestOptions
-from slimsfm.features.base import shrink_factor
+from slimsfm.features import Features, NearestOptions, shrink_factor
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
 

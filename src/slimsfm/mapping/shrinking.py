@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from slimsfm.features import Features
-from slimsfm.features.base import shrink_factor
+from slimsfm.features import Features, shrink_factor
 from slimsfm.geometry import resized_camera
 from slimsfm.mapping.sfm import put_keypoints
 

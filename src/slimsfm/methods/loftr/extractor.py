@@ -23,7 +23,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import PairChoice, Pairs, exhaustive_pairs, sequential_pairs
 from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher, Photo
 from slimsfm.methods.loftr.mapping import build_without_keypoints
-from slimsfm.photos import read_image
+from slimsfm.photos import read_photo
 from slimsfm.weights import find_weights
 
 _CACHED = 32  # encoded reference photos kept in memory: 45 MB each at 640 x 480
@@ -223,7 +223,7 @@ class PhotoFolder(Mapping[str, Photo]):
     def __getitem__(self, name: str) -> Photo:
         if name not in self._names:
             raise KeyError(name)
-        return read_image(self._folder / name)
+        return read_photo(self._folder / name, warn=False).image
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
