@@ -64,8 +64,8 @@ def read_photo(path: str | Path, *, warn: bool = True) -> Photo:
     stored = _read(path)
     if warn and stored.num_frames > 1:
         _LOGGER.warning("%s: the first of %d frames or pages is used", path, stored.num_frames)
-    image = upright(_as_rgb(stored.values), stored.orientation)
-    alpha = None if stored.alpha is None else upright(stored.alpha, stored.orientation)
+    image = upright(_as_rgb(stored.values), stored.turn)
+    alpha = None if stored.alpha is None else upright(stored.alpha, stored.turn)
     return Photo(image=image, alpha=alpha, orientation=stored.orientation, num_frames=stored.num_frames)
 
 
@@ -98,7 +98,7 @@ def read_stored_mask(path: str | Path) -> StoredMask:
     kept = stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2)
     if stored.alpha is not None:
         kept &= stored.alpha > 0
-    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.orientation)
+    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.turn)
 
 
 def read_mask(path: str | Path) -> GrayImage:
@@ -127,6 +127,7 @@ class _Stored(NamedTuple):
     values: Shaped[np.ndarray, "_ _ *channels"]  # gray or RGB of any depth
     alpha: GrayImage | None
     orientation: int
+    turn: int  # the orientation, or 1 if Pillow has turned the values already, as it does with TIFF
     num_frames: int
 
 
@@ -139,13 +140,19 @@ def _read(path: str | Path) -> _Stored:
         orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
         # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
         num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
+        turn = orientation
         if values is None:
             values, alpha = _values(file)
+            turn = file.getexif().get(ExifTags.Base.Orientation, 1)
         elif values.ndim == 3 and values.shape[2] == 4:
             values, alpha = values[..., :3], values[..., 3]
         if alpha is not None:
             alpha = None if alpha.all() else np.where(alpha, 255, 0).astype(np.uint8)
-        return _Stored(values, alpha, orientation if orientation in range(1, 9) else 1, num_frames)
+        return _Stored(values, alpha, _valid(orientation), _valid(turn), num_frames)
+
+
+def _valid(orientation: object) -> int:
+    return orientation if isinstance(orientation, int) and orientation in range(1, 9) else 1
 
 
 def _values(
@@ -252,7 +259,8 @@ def camera_from_exif(path: str | Path) -> pycolmap.Camera:
         ImageError: The file is missing or not an image.
     """
     with _reading(path), _opened(path) as file:
-        turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
+        # The size of a TIFF is that of the upright image already.
+        turned = file.format != "TIFF" and _valid(file.getexif().get(ExifTags.Base.Orientation)) >= 5
         upright_size = file.size[::-1] if turned else file.size
         try:
             camera = pycolmap.infer_camera_from_image(path)
