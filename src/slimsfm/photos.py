@@ -133,10 +133,7 @@ class _Stored(NamedTuple):
 
 def _read(path: str | Path) -> _Stored:
     with _reading(path), _opened(path) as file:
-        values, alpha = (
-            _deep_values(file, path),
-            None,
-        )  # first, because Pillow forgets the depth when it decodes
+        values, alpha = _deep_values(file, path), None  # first: once it decodes, Pillow forgets the depth
         orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
         # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
         num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
@@ -208,15 +205,15 @@ def _as_bytes(values: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape
 
 @contextmanager
 def _opened(path: str | Path) -> Iterator[PillowImage.Image]:
-    with Path(path).open("rb") as raw:
+    with Path(path).open("rb") as raw:  # given a path, Pillow maps TIFF into memory and mixes up turned ones
         head = raw.read(12)
-    if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
-        raise ImageError(f"{path}: {INSTALL_HEIC}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PillowImage.DecompressionBombWarning)
-        file = PillowImage.open(path)
-    with file:
-        yield file
+        if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
+            raise ImageError(f"{path}: {INSTALL_HEIC}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PillowImage.DecompressionBombWarning)
+            file = PillowImage.open(raw)
+        with file:
+            yield file
 
 
 @cache
