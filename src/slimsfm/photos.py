@@ -50,6 +50,11 @@ class Photo:
     num_frames: int
     """Number of frames or pages in the file, of which this is the first."""
 
+    @property
+    def visible(self) -> GrayImage | None:
+        """The mask of a query: `alpha`, unless nothing would be left."""
+        return self.alpha if self.alpha is not None and self.alpha.any() else None
+
 
 def read_photo(path: str | Path, *, warn: bool = True) -> Photo:
     """Read an image of any format, color mode and bit depth, turned upright by its EXIF orientation.
@@ -132,7 +137,7 @@ class _Stored(NamedTuple):
 
 
 def _read(path: str | Path) -> _Stored:
-    with _reading(path), _opened(path) as file:
+    with _reading(path), opened_image(path) as file:
         values, alpha = _deep_values(file, path), None  # first: once it decodes, Pillow forgets the depth
         orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
         # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
@@ -204,7 +209,12 @@ def _as_bytes(values: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator[PillowImage.Image]:
+def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
+    """Open an image file by Pillow, HEIC included.
+
+    Raises:
+        ImageError: It is a HEIC photo, and the package for them is missing.
+    """
     with Path(path).open("rb") as raw:  # given a path, Pillow maps TIFF into memory and mixes up turned ones
         head = raw.read(12)
         if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
@@ -255,17 +265,19 @@ def camera_from_exif(path: str | Path) -> pycolmap.Camera:
     Raises:
         ImageError: The file is missing or not an image.
     """
-    with _reading(path), _opened(path) as file:
-        # The size of a TIFF is that of the upright image already.
-        turned = file.format != "TIFF" and _valid(file.getexif().get(ExifTags.Base.Orientation)) >= 5
+    with _reading(path), opened_image(path) as file:
+        turned = _valid(file.getexif().get(ExifTags.Base.Orientation)) >= 5
+        if file.format == "TIFF":  # Pillow turns it when it decodes, and its size before or then
+            file.load()
+            turned = False
         upright_size = file.size[::-1] if turned else file.size
         try:
             camera = pycolmap.infer_camera_from_image(path)
+            focal_px, is_known = camera.focal_length, camera.has_prior_focal_length
         except ValueError:  # COLMAP does not read this format
-            focal_px = _GUESS * max(upright_size)
-            camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *upright_size)
-    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
-    guess.has_prior_focal_length = camera.has_prior_focal_length
+            focal_px, is_known = _GUESS * max(upright_size), False
+    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *upright_size)
+    guess.has_prior_focal_length = is_known
     return guess
 
 

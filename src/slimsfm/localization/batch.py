@@ -88,7 +88,8 @@ def localize_images(
 ) -> dict[str, Localization]:
     """Localize the images of a folder.
 
-    Results do not depend on the number of workers. Transparent pixels of an image hold no features.
+    Results do not depend on the number of workers. Transparent pixels of an image hold no features,
+    unless all are.
 
     Args:
         localizer: Localizer of the map.
@@ -178,4 +179,4 @@ def _localize_one(
     localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
 ) -> dict[str, Localization]:
     photo = read_photo(task.path)
-    return localizer.localize(photo.image, task.cameras, gravity.get(task.name), photo.alpha)
+    return localizer.localize(photo.image, task.cameras, gravity.get(task.name), photo.visible)
