@@ -1,6 +1,7 @@
 """`slimsfm info`."""
 
 import json as json_format
+from dataclasses import asdict
 
 from slimsfm.cli.options import MapPath
 from slimsfm.cli.output import console, counts, plural, print_notes, size
@@ -42,6 +43,7 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         "extractor": {"name": map.info.extractor, "options": map.info.extractor_options},
         "origin": map.info.origin,
         "notes": list(map.info.notes),
+        "quality": asdict(map.info.quality) if map.info.quality else None,
         "bytes": sizes,
     }
 
@@ -59,10 +61,12 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
     matches = f", {plural(len(map.matches), 'verified pair')}" if map.matches else ""
     options = ", ".join(f"{key} {value}" for key, value in info.extractor_options.items())
     unit = "map units (unknown scale)" if info.unit == "unknown" else info.unit
+    support = {"support": map.info.quality.summary} if map.info.quality else {}
     return {
         "map": map.describe(),
         "images": f"{len(map.images)}{matches}",
         "points": points,
+        **support,
         "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
         "extractor": info.extractor + (f" ({options})" if options else ""),
         "size": ", ".join(f"{part} {size(number)}" for part, number in sizes.items()),

@@ -13,7 +13,9 @@ MAP/
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -41,6 +43,7 @@ from slimsfm.mapping.descriptors import (
 )
 from slimsfm.mapping.map import Map, MapInfo, check_map, check_num_features
 from slimsfm.mapping.model import read_model
+from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import shrink
 
 _QUALITY = 95
@@ -211,7 +214,15 @@ def _info_to_json(info: MapInfo) -> dict:
         "unit": info.unit,
         "origin": info.origin,
         "notes": list(info.notes),
+        "quality": None if info.quality is None else asdict(info.quality),
     }
+
+
+def _quality(data: dict[str, Any] | None) -> ModelQuality | None:
+    if data is None:
+        return None
+    lists = {key: tuple(data[key]) for key in ("doubtful", "pieces")}
+    return ModelQuality(**{**data, **lists})
 
 
 def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
@@ -235,7 +246,8 @@ def _read_info(path: Path) -> MapInfo:
             box_source=data["box"]["source"],
             unit=data["unit"],
             origin=data["origin"],
-            notes=tuple(data.get("notes", ())),
+            notes=tuple(map(str, data.get("notes", ()))),
+            quality=_quality(data.get("quality")),
         )
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error
