@@ -32,9 +32,7 @@ def equal_sides(frames: int, width: int, height: int, seed: int) -> Take:
 def repeating_can(frames: int, width: int, height: int, seed: int) -> Take:
     """A can whose print repeats once around, on a tiled floor, with a few things far behind it."""
     rng, radius, tall = np.random.default_rng([seed, 11]), 0.05, 0.15
-    label = texture.page(
-        rng, round(tall * _TEXELS_PER_METER), round(np.pi * radius * _TEXELS_PER_METER), cell=90
-    )
+    label = texture.page(rng, round(tall * _TEXELS_PER_METER), round(np.pi * radius * _TEXELS_PER_METER), cell=90)
     lid = texture.tinted_noise(rng, 128, 128, (170, 172, 178), 0.2, cells=8)
     lid = np.concatenate([lid[:64], lid[:64][::-1, ::-1]])
     mesh = shapes.lathe([radius] * 2, [tall / 2, -tall / 2], np.tile(label, (1, 2, 1)), [lid, lid])
@@ -72,9 +70,7 @@ def repeating_room(frames: int, width: int, height: int, seed: int) -> Take:
         place = (rng.uniform(-0.7, 0.7), _HALF_ROOM - 0.02, rng.uniform(0.1, 0.5))
         pictures.append(picture.apply_translation(place).apply_transform(turn))
     table = shapes.box((0.5, 0.5, 0.06), [texture.tinted_noise(rng, 200, 200, (150, 120, 90), 0.2)] * 6)
-    bowl = shapes.lathe(
-        [0.08, 0.04], [0.05, -0.02], texture.page(rng, 120, 500, cell=50), [carpet[:64, :64]] * 2
-    )
+    bowl = shapes.lathe([0.08, 0.04], [0.05, -0.02], texture.page(rng, 120, 500, cell=50), [carpet[:64, :64]] * 2)
     meshes = [table, bowl.apply_translation((0.1, 0.05, 0.06)), floor, *walls, *pictures]
     return _around(rng, meshes, frames, width, height, radius=1.15)
 
