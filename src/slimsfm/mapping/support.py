@@ -95,7 +95,11 @@ def _rays(image: pycolmap.Image) -> Points2D:
 
 
 def _agrees(
-    a: pycolmap.Image, b: pycolmap.Image, rays_a: Points2D, rays_b: Points2D, pairs: IndexPairs
+    a: pycolmap.Image,
+    b: pycolmap.Image,
+    rays_a: Float64[np.ndarray, "_ 2"],
+    rays_b: Float64[np.ndarray, "_ 2"],
+    pairs: IndexPairs,
 ) -> Bool[np.ndarray, " n"]:
     essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
     squared = pycolmap.compute_squared_sampson_error(rays_a[pairs[:, 0]], rays_b[pairs[:, 1]], essential)
