@@ -5,8 +5,8 @@
 Without a folder of photos, a box is rendered. Prints a table with a line per kind of input: images
 registered, points, observations on masked pixels, difference of the poses from those of the first line, and
 what the map notes. The difference is the largest relative corner error after both maps were aligned. Enlarged
-photos are shrunk to the size of the others for extraction. With `pillow-heif` installed, HEIC is tried as
-well.
+photos repeat pixels, and are shrunk to the size of the others for extraction. With `pillow-heif` installed,
+HEIC is tried as well.
 """
 
 import argparse
@@ -188,7 +188,7 @@ def kinds() -> list[Kind]:
         Kind(name="mask IMG_mask.png", write=masked("IMG_mask.png", "8 bits"), hole=True, masks=True),
         Kind(name="turned by EXIF, stored mask", write=turned, hole=True, masks=True),
         Kind(name="two frames", write=animated),
-        *(Kind(name=f"{times} times as large", write=saved("jpg", times=times)) for times in (2, 4, 6)),
+        *(Kind(name=f"{times} times as large", write=saved("bmp", times=times)) for times in (2, 4, 6)),
         Kind(name="files that are not read", write=with_others),
     ]
 
@@ -208,7 +208,7 @@ def saved(suffix: str, mode: str = "RGB", times: int = 1) -> Write:
         elif mode != "RGB":
             image = image.convert(mode)
         if times > 1:
-            image = image.resize((times * image.width, times * image.height), PillowImage.Resampling.BICUBIC)
+            image = image.resize((times * image.width, times * image.height), PillowImage.Resampling.NEAREST)
         image.save(f"{path}.{suffix}", quality=95)
 
     return write
