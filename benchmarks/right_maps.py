@@ -2,9 +2,9 @@
 
     python benchmarks/right_maps.py -o /tmp/right --photos DIR --other DIR
 
-Renders the look-alike scenes. Makes mixtures, brackets, zooms and others from the first half of the photos
-that are given, with a map of all of them as the truth. Prints, for each scene, how many images are registered,
-how many of those are right (rotation within 5 degrees, relative to the other images), and the time.
+Renders the look-alike scenes. Makes mixtures, brackets, zooms and others from half of the photos that are
+given, with a map of all of them as the truth. Prints, for each scene, how many images are registered, how many
+of those are right (rotation within 5 degrees, relative to the other images), and the time.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from hard_photos import MAKERS
 from lookalikes import LOOKALIKES
 from slimsfm.cli.output import quiet
 from slimsfm.errors import SlimsfmError
-from slimsfm.mapping import build_map
+from slimsfm.mapping import Map, build_map
 from slimsfm.photos import list_images
 from slimsfm.progress import shown
 
@@ -39,10 +39,7 @@ def scenes(output: Path, photos: Path | None, other: Path | None) -> Iterator[tu
         yield name, *_rendered(output / name, name)
     if photos is None or other is None:
         return
-    truth = {
-        Path(name).stem: image.cam_from_world().rotation
-        for name, image in build_map(photos, progress=shown).images.items()
-    }
+    truth = _rotations(build_map(photos, progress=shown))
     yield photos.name, photos, {}
     for name, maker in MAKERS.items():
         folder = output / name
@@ -89,9 +86,11 @@ def ours(folder: Path) -> tuple[Rotations, str]:
         return {}, f"refused: {error}"
     quality = made.info.quality
     said = [*made.info.notes, *(quality.doubts if quality else ())]
-    return {
-        Path(name).stem: image.cam_from_world().rotation for name, image in made.images.items()
-    }, "; ".join(said)
+    return _rotations(made), "; ".join(said)
+
+
+def _rotations(map: Map) -> Rotations:
+    return {Path(name).stem: image.cam_from_world().rotation for name, image in map.images.items()}
 
 
 def plain(folder: Path) -> tuple[Rotations, str]:

@@ -1,62 +1,240 @@
-"""Image files: list them, read their upright pixels, and guess their cameras from EXIF data."""
+"""Image files: read their upright pixels, and guess their cameras from EXIF data.
 
+Pixels of more than eight bits are scaled to eight by the bits that the image uses: 8, 10, 12, 14, 16 ... hold
+its largest value. So 12-bit values in a file of 16 bits are as bright as in one of 12. Floating-point values
+are from 0 (black) to 1 (white) unless one is larger, and then count as integers; values below 0 and those
+that are no number are black.
+"""
+
+import logging
+import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import UInt8
-from PIL import ExifTags, ImageOps, UnidentifiedImageError
+from jaxtyping import Shaped, UInt8
+from PIL import ExifTags, ImageCms, UnidentifiedImageError
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import GrayImage, Image
-from slimsfm.errors import ImageError, InputError
+from slimsfm.errors import ImageError
+from slimsfm.image_files import INSTALL_HEIC, can_read_heic
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
-
-_UNREADABLE = (
-    UnidentifiedImageError,
-    PillowImage.DecompressionBombError,
-    OSError,
-    ValueError,
-    SyntaxError,
-    RuntimeError,
-)
+_LOGGER = logging.getLogger(__name__)
+_UNREADABLE = (UnidentifiedImageError, OSError, EOFError, ValueError, SyntaxError, RuntimeError)
+_HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+_GUESS = 1.2  # focal length over the longer side, as COLMAP guesses it
+_WIDE = "I", "F"  # first letters of Pillow's modes of more than eight bits
 
 
-def list_images(folder: str | Path) -> list[str]:
-    """List the images in a folder and its subfolders.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photo:
+    """An upright image, and what its file says besides."""
 
-    Returns:
-        Paths relative to the folder, with forward slashes, sorted; without hidden files and folders.
+    image: Image
+    """RGB."""
+
+    alpha: GrayImage | None
+    """0 where the image is fully transparent, 255 elsewhere; None if it is nowhere."""
+
+    orientation: int
+    """EXIF orientation that the stored pixels were turned by; 1 if not at all."""
+
+    num_frames: int
+    """Number of frames or pages in the file, of which this is the first."""
+
+    @property
+    def visible(self) -> GrayImage | None:
+        """The mask of a query: `alpha`, unless nothing would be left."""
+        return self.alpha if self.alpha is not None and self.alpha.any() else None
+
+
+def read_photo(path: str | Path, *, warn: bool = True) -> Photo:
+    """Read an image of any format, color mode and bit depth, turned upright by its EXIF orientation.
+
+    Args:
+        path: The file; of several frames or pages the first is read.
+        warn: Log a warning if there are several.
 
     Raises:
-        InputError: The folder does not exist or contains no image.
+        ImageError: The file is missing, not a complete image, or too large.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of images")
-    paths = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
-    names = sorted(path.relative_to(folder).as_posix() for path in paths)
-    names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
-    if not names:
-        raise InputError(f"{folder}: contains no image ({', '.join(sorted(SUFFIXES))})")
-    return names
+    stored = _read(path)
+    if warn and stored.num_frames > 1:
+        _LOGGER.warning("%s: the first of %d frames or pages is used", path, stored.num_frames)
+    image = upright(_as_rgb(stored.values), stored.turn)
+    alpha = None if stored.alpha is None else upright(stored.alpha, stored.turn)
+    return Photo(image=image, alpha=alpha, orientation=stored.orientation, num_frames=stored.num_frames)
 
 
 def read_image(path: str | Path) -> Image:
-    """Read an image as RGB and rotate it upright according to its EXIF orientation.
+    """Read an image as upright RGB like `read_photo`, without its transparency.
 
     Raises:
-        ImageError: The file is missing or not a complete image.
+        ImageError: As in `read_photo`.
     """
-    with _reading(path), PillowImage.open(path) as file:
-        upright = ImageOps.exif_transpose(file)
-        if upright.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8 instead of scaling them
-            upright = PillowImage.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-        return np.array(upright.convert("RGB"))
+    return read_photo(path).image
+
+
+class StoredMask(NamedTuple):
+    """A mask as its file holds it."""
+
+    mask: GrayImage
+    """255 where features are kept, 0 elsewhere."""
+
+    orientation: int
+    """EXIF orientation of the file, 1 if it has none."""
+
+
+def read_stored_mask(path: str | Path) -> StoredMask:
+    """Read a mask of any color mode and bit depth as stored: what is not black or transparent is kept.
+
+    Raises:
+        ImageError: As in `read_photo`.
+    """
+    stored = _read(path)
+    kept = stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2)
+    if stored.alpha is not None:
+        kept &= stored.alpha > 0
+    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.turn)
+
+
+def read_mask(path: str | Path) -> GrayImage:
+    """Read a mask like `read_stored_mask`, turned upright by its EXIF orientation.
+
+    Raises:
+        ImageError: As in `read_photo`.
+    """
+    return upright(*read_stored_mask(path))
+
+
+def upright(
+    stored: Shaped[np.ndarray, "_ _ *channels"], orientation: int
+) -> Shaped[np.ndarray, "_ _ *channels"]:
+    """Turn stored pixels upright that have this EXIF orientation."""
+    if orientation >= 5:
+        stored = stored.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        stored = stored[::-1]
+    if orientation in (2, 3, 6, 7):
+        stored = stored[:, ::-1]
+    return np.ascontiguousarray(stored)
+
+
+class _Stored(NamedTuple):
+    values: Shaped[np.ndarray, "_ _ *channels"]  # gray or RGB of any depth
+    alpha: GrayImage | None
+    orientation: int
+    turn: int  # the orientation, or 1 if Pillow has turned the values already, as it does with TIFF
+    num_frames: int
+
+
+def _read(path: str | Path) -> _Stored:
+    with _reading(path), opened_image(path) as file:
+        values, alpha = _deep_values(file, path), None  # first: once it decodes, Pillow forgets the depth
+        orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
+        # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
+        num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
+        turn = orientation
+        if values is None:
+            values, alpha = _values(file)
+            turn = file.getexif().get(ExifTags.Base.Orientation, 1)
+        elif values.ndim == 3 and values.shape[2] == 4:
+            values, alpha = values[..., :3], values[..., 3]
+        if alpha is not None:
+            alpha = None if alpha.all() else np.where(alpha, 255, 0).astype(np.uint8)
+        return _Stored(values, alpha, _valid(orientation), _valid(turn), num_frames)
+
+
+def _valid(orientation: object) -> int:
+    return orientation if isinstance(orientation, int) and orientation in range(1, 9) else 1
+
+
+def _values(
+    file: PillowImage.Image,
+) -> tuple[Shaped[np.ndarray, "_ _ *channels"], Shaped[np.ndarray, "_ _"] | None]:
+    """Gray or RGB values and alpha as Pillow decodes them."""
+    if file.mode.startswith(_WIDE):
+        return np.array(file), None
+    if file.mode == "LAB":
+        lab, rgb = (ImageCms.createProfile(space) for space in ("LAB", "sRGB"))
+        file = ImageCms.profileToProfile(file, lab, rgb, outputMode="RGB") or file
+    if file.has_transparency_data:
+        pixels = np.array(file.convert("RGBA"))
+        return pixels[..., :3], pixels[..., 3]
+    return np.array(file.convert("RGB")), None
+
+
+def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray, "_ _ _"] | None:
+    """RGB or RGBA of 16 bits per channel, of which Pillow keeps the upper eight; None for other images."""
+    if file.mode.startswith(_WIDE) or not _is_deep(file):
+        return None
+    file.load()  # OpenCV takes half a file for a whole one, Pillow does not
+    found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.dtype != np.uint16 or found.ndim != 3:
+        return None
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+
+
+def _is_deep(file: PillowImage.Image) -> bool:
+    arguments = [tile[3] for tile in getattr(file, "tile", [])]
+    parts = [part for one in arguments for part in (one if isinstance(one, tuple) else (one,))]
+    if file.format == "PPM":
+        return any(isinstance(part, int) and part > 255 for part in parts)
+    return any(isinstance(part, str) and ";16" in part for part in parts)
+
+
+def _as_rgb(values: Shaped[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w 3"]:
+    if values.dtype != np.uint8:
+        values = _as_bytes(values)
+    return np.repeat(values[..., None], 3, axis=2) if values.ndim == 2 else values
+
+
+def _as_bytes(values: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Scale values of more than eight bits to eight, by the rule at the top of this module."""
+    is_float = np.issubdtype(values.dtype, np.floating)
+    values = np.maximum(np.where(np.isfinite(values), values, 0) if is_float else values, 0)
+    most = values.max(initial=0)
+    if is_float and most <= 1:
+        return np.round(255 * values).astype(np.uint8)
+    bits = max(8, int(most).bit_length())
+    return (values // 2 ** (bits + bits % 2 - 8)).astype(np.uint8)
+
+
+@contextmanager
+def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
+    """Open an image file by Pillow, HEIC included.
+
+    Raises:
+        ImageError: It is a HEIC photo, and the package for them is missing.
+    """
+    with Path(path).open("rb") as raw:  # given a path, Pillow maps TIFF into memory and mixes up turned ones
+        head = raw.read(12)
+        if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
+            raise ImageError(f"{path}: {INSTALL_HEIC}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PillowImage.DecompressionBombWarning)
+            file = PillowImage.open(raw)
+        with file:
+            yield file
+
+
+@cache
+def _register_heic() -> bool:
+    """Teach Pillow to read HEIC; returns whether that is possible."""
+    if not can_read_heic():
+        return False
+    import pillow_heif  # an extra
+
+    pillow_heif.register_heif_opener()
+    return True
 
 
 @contextmanager
@@ -65,17 +243,16 @@ def _reading(path: str | Path) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise ImageError(f"{path}: no such image") from error
+    except PillowImage.DecompressionBombError as error:
+        has, most = (int(number) / 1e6 for number in re.findall(r"\d+", str(error))[:2])
+        raise ImageError(
+            f"{path}: has {has:.0f} megapixels, too large: up to {most:.0f} are read; shrink the image"
+        ) from error
     except _UNREADABLE as error:
-        raise ImageError(f"{path}: not a readable image; remove or replace it") from error
-
-
-def read_mask(path: str | Path) -> GrayImage:
-    """Read a mask of any color mode: features are kept where it is not black.
-
-    Raises:
-        ImageError: The file is missing or not a complete image.
-    """
-    return read_image(path).max(axis=2)
+        raise ImageError(
+            f"{path}: not a readable image: damaged, or of a kind that is not supported; convert, replace or "
+            "remove it"
+        ) from error
 
 
 def camera_from_exif(path: str | Path) -> pycolmap.Camera:
@@ -88,12 +265,19 @@ def camera_from_exif(path: str | Path) -> pycolmap.Camera:
     Raises:
         ImageError: The file is missing or not an image.
     """
-    with _reading(path), PillowImage.open(path) as file:
-        turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
+    with _reading(path), opened_image(path) as file:
+        turned = _valid(file.getexif().get(ExifTags.Base.Orientation)) >= 5
+        if file.format == "TIFF":  # Pillow turns it when it decodes, and its size before or then
+            file.load()
+            turned = False
         upright_size = file.size[::-1] if turned else file.size
-        camera = pycolmap.infer_camera_from_image(path)
-    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
-    guess.has_prior_focal_length = camera.has_prior_focal_length
+        try:
+            camera = pycolmap.infer_camera_from_image(path)
+            focal_px, is_known = camera.focal_length, camera.has_prior_focal_length
+        except ValueError:  # COLMAP does not read this format
+            focal_px, is_known = _GUESS * max(upright_size), False
+    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *upright_size)
+    guess.has_prior_focal_length = is_known
     return guess
 
 

@@ -17,6 +17,7 @@ from PIL import ExifTags, ImageOps
 from PIL import Image as PilImage
 
 from slimsfm.errors import ImageError, InputError
+from slimsfm.photos import opened_image
 
 PIXEL_CENTER = 0.5
 """Both coordinates of the center of the top-left pixel in COLMAP's convention."""
@@ -101,7 +102,7 @@ def read_text(path: Path) -> str:
         InputError: The file is missing or not text.
     """
     try:
-        return path.read_text()
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise InputError(f"{path} cannot be read: there is no such file") from error
     except (OSError, UnicodeDecodeError) as error:
@@ -203,7 +204,7 @@ def image_size(path: Path) -> tuple[int, int]:
         ImageError: The file is missing or not an image.
     """
     try:
-        with PilImage.open(path) as image:
+        with opened_image(path) as image:
             if image.format == "PNG" and "exif" not in image.info:
                 return image.size  # EXIF after the pixels would require decoding them
             if image.format == "TIFF":

@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import pycolmap
 
-from slimsfm.arrays import Image
+from slimsfm.arrays import GrayImage, Image
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.features import Features
+from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.photos import list_images, read_image
+from slimsfm.photos import read_photo
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
 
@@ -41,6 +42,7 @@ class MultiLocalizer:
         image: Image,
         cameras: Mapping[str, pycolmap.Camera | None] | None = None,
         gravity: Gravity | None = None,
+        mask: GrayImage | None = None,
     ) -> dict[str, Localization]:
         """Search one image for every object.
 
@@ -49,6 +51,7 @@ class MultiLocalizer:
             cameras: Intrinsics by name of the object; where they are missing or None, those of the object's
                 map are used.
             gravity: As in `Localizer.localize`; all maps must share one frame.
+            mask: As in `Localizer.localize`.
 
         Returns:
             The outcome by name of the object, in the order of the localizers. The image shows the objects
@@ -64,7 +67,7 @@ class MultiLocalizer:
             info, start = localizer.map.info, perf_counter()
             key = repr((info.extractor, sorted(info.extractor_options.items())))
             if key not in extracted:
-                extracted[key] = localizer.extractor.extract(image)
+                extracted[key] = localizer.extractor.extract(image, mask)
             seconds = perf_counter() - start
             one = localizer.localize_features(extracted[key], camera, gravity)
             found[name] = replace(one, seconds=replace(one.seconds, extract=seconds))
@@ -85,7 +88,8 @@ def localize_images(
 ) -> dict[str, Localization]:
     """Localize the images of a folder.
 
-    Results do not depend on the number of workers.
+    Results do not depend on the number of workers. Transparent pixels of an image hold no features,
+    unless all are.
 
     Args:
         localizer: Localizer of the map.
@@ -157,6 +161,7 @@ def _localize(
 def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | None) -> list[_Task]:
     """All images with their intrinsics, so that an image without intrinsics fails before the work begins."""
     folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
+    check_names(folder, names)
     return [
         _Task(
             name=name,
@@ -173,4 +178,5 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
 def _localize_one(
     localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
 ) -> dict[str, Localization]:
-    return localizer.localize(read_image(task.path), task.cameras, gravity.get(task.name))
+    photo = read_photo(task.path)
+    return localizer.localize(photo.image, task.cameras, gravity.get(task.name), photo.visible)

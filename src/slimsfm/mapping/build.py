@@ -12,12 +12,12 @@ import pycolmap
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
-from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.diagnosis import diagnose
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos, find_photos
 from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.quality import ModelQuality
@@ -25,13 +25,12 @@ from slimsfm.mapping.reconstruction import pick_model, reconstruct
 from slimsfm.mapping.sfm import (
     colmap_warnings,
     match_pairs,
-    put_keypoints,
     triangulate,
     verified_matches,
     write_database,
 )
+from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.support import measure
-from slimsfm.photos import list_images
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -49,7 +48,11 @@ class BuildOptions:
     detector, exhaustive up to 30 images, otherwise by pose if poses are known, else sequential."""
 
     masks: Path | None = None
-    """Folder of masks, NAME.png for image NAME as in COLMAP; features on black pixels are ignored."""
+    """Folder of masks, IMG.jpg.png or IMG.png for image IMG.jpg as in COLMAP; where a mask is black, no
+    features are used."""
+
+    alpha: AlphaUse = "mask"
+    """What transparency does: transparent pixels hold no features (mask), or are like any others (ignore)."""
 
     extractor: str = "sift"
     """Local features, see `slimsfm methods`; loftr matches images without a detector."""
@@ -107,8 +110,9 @@ def build_map(
 ) -> Map:
     """Build a map from a folder of photos by Structure from Motion.
 
-    Photos that could not be registered are named in `Map.unregistered`. The map reads its features from disk
-    when they are needed, so that large maps fit into memory.
+    Photos that could not be registered are named in `Map.unregistered`, and what was skipped or ignored in
+    `MapInfo.notes`. The map reads its features from disk when they are needed, so that large maps fit into
+    memory.
 
     Args:
         images: Folder. All images in it and its subfolders are used or, with known poses, those with a pose.
@@ -123,20 +127,35 @@ def build_map(
         ReconstructionError: The images give no model.
     """
     images = Path(images)
-    names = sorted(known.cam_from_world) if known else list_images(images)
+    if known:
+        names, notes = sorted(known.cam_from_world), ()
+    else:
+        found = find_photos(images, options.masks)
+        names, notes = list(found.names), found.notes
     if len(names) < 2:
-        raise InputError(f"{images}: holds {len(names)} image; a map needs at least two")
+        few = f"{images}: holds {len(names)} image; a map needs at least two"
+        raise InputError("; ".join([few, *notes]))
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
+    photos = MaskedPhotos(images, names, options.masks, options.alpha)
     cameras = known.cameras if known else guess_cameras(images, names, options.camera)
     with _opened(workspace) as folder, colmap_warnings():
         work = BuildWork(
-            images=images, names=names, workspace=folder, cameras=cameras, known=known, progress=progress
+            images=images,
+            photos=photos,
+            names=names,
+            workspace=folder,
+            cameras=cameras,
+            known=known,
+            progress=progress,
         )
-        if isinstance(extractor, ModelBuilder):
-            parts = extractor.build_model(work, options)
-        else:
-            parts = _parts_with_keypoints(work, extractor, options)
+        try:
+            if isinstance(extractor, ModelBuilder):
+                parts = extractor.build_model(work, options)
+            else:
+                parts = _parts_with_keypoints(work, extractor, options)
+        except ReconstructionError as error:  # what was skipped may be the reason
+            raise ReconstructionError("; ".join([str(error), *notes, *photos.notes])) from error
     quality = measure(parts.model, parts.matches, names)
     info = MapInfo(
         extractor=parts.extractor.name,
@@ -146,7 +165,7 @@ def build_map(
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
         quality=replace(quality, focal_origins=_origins(quality, cameras, known)),
-        notes=parts.notes,
+        notes=(*notes, *photos.notes, *parts.notes),
     )
     registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     made = Map(
@@ -187,6 +206,9 @@ class BuildWork:
 
     images: Path
     """Folder of the photos."""
+
+    photos: MaskedPhotos
+    """The photos with their masks."""
 
     names: list[str]
     """Names of the photos to use, relative to the folder."""
@@ -243,8 +265,9 @@ class ModelBuilder(Protocol):
 
 def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
-    features, colors = extract_features(work.images, names, extractor, options.masks, output, work.progress)
-    database, sfm = _match(work, features, options), work.workspace / "sfm"
+    features, colors = extract_features(work.photos, names, extractor, output, work.progress)
+    shrunk = ShrunkImages.by_extractor(features, work.cameras, extractor.options)
+    database, sfm = _match(work, shrunk, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
     notes: tuple[str, ...] = ()
     if work.known:
@@ -255,13 +278,13 @@ def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildO
             models = reconstruct(database, names, sfm, seed=seed, progress=progress)
         except ReconstructionError as error:
             matches = verified_matches(database, dict(enumerate(names, start=1)))
-            reasons = [str(error), diagnose(work.images, names, features, matches)]
+            reasons = [str(error), diagnose(work.images, names, shrunk.features, matches)]
             raise ReconstructionError(
                 f"{work.images}: these {len(names)} photos give no model: {'; '.join(filter(None, reasons))}"
             ) from error
         model, notes = pick_model(models, options.model)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    put_keypoints(model, features)
+    shrunk.enlarge(model, known_cameras=work.known is not None)
     color_points(model, colors)
     return MapParts(extractor=extractor, model=model, features=features, matches=matches, notes=notes)
 
@@ -273,9 +296,9 @@ def _extractor(options: BuildOptions) -> Extractor:
     )
 
 
-def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Path:
-    database = work.workspace / "database.db"
-    write_database(database, features, work.cameras)
+def _match(work: BuildWork, shrunk: ShrunkImages, options: BuildOptions) -> Path:
+    database, features = work.workspace / "database.db", shrunk.whole
+    write_database(database, shrunk.features, shrunk.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
         match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)

@@ -23,8 +23,8 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features import Features, unit_rows
 from slimsfm.features.store import FeatureWriter, write_matches
 from slimsfm.files import replacing
+from slimsfm.image_files import list_images
 from slimsfm.mapping.map import Map, check_num_features
-from slimsfm.photos import list_images
 
 
 def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overwrite: bool = False) -> None:
@@ -38,7 +38,8 @@ def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overw
 
     Raises:
         MapError: The map is for direct matching only.
-        InputError: A query has the name of an image of the map, or a name in a pair contains a space.
+        InputError: A query has the name of an image of the map, a name in a pair has a space, or a name has a
+            line break.
         OutputError: The folder exists and `overwrite` is off, or it cannot be written.
     """
     if map.is_for_direct_matching:
@@ -72,7 +73,7 @@ def read_query_names(path: str | Path) -> list[str]:
     if path.is_dir():
         return list_images(path)
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: neither a folder of images nor a readable list of names") from error
     names = [_name(line, path) for line in lines if line.strip() and not line.startswith("#")]
@@ -123,4 +124,7 @@ def _as_in_hloc(features: Features) -> Features:
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:
-    path.write_text("".join(f"{line}\n" for line in lines))
+    lines = list(lines)
+    if broken := [line for line in lines if line.splitlines() != [line]]:
+        raise InputError(f"{broken[0]!r}: a list with a name per line cannot hold it; rename the image")
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

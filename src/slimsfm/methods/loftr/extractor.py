@@ -23,7 +23,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import PairChoice, Pairs, exhaustive_pairs, sequential_pairs
 from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher, Photo
 from slimsfm.methods.loftr.mapping import build_without_keypoints
-from slimsfm.photos import read_image
+from slimsfm.photos import read_photo
 from slimsfm.weights import find_weights
 
 _CACHED = 32  # encoded reference photos kept in memory: 45 MB each at 640 x 480
@@ -189,7 +189,7 @@ class DetectorFree:
             work.cameras,
             work.workspace,
             cam_from_world=poses,
-            masks=options.masks,
+            masks=_masks(work),
             number=options.model,
             seed=options.seed,
             progress=work.progress,
@@ -208,6 +208,13 @@ class DetectorFree:
         return DetectorFreeMatching(map, lambda: self.matcher)
 
 
+def _masks(work: BuildWork) -> dict[str, GrayImage]:
+    read = ((name, work.photos.read(name).mask) for name in work.names)
+    masks = {name: mask for name, mask in read if mask is not None}
+    work.photos.check()
+    return masks
+
+
 class PhotoFolder(Mapping[str, Photo]):
     """Photos of a folder by name, read on access."""
 
@@ -218,7 +225,7 @@ class PhotoFolder(Mapping[str, Photo]):
     def __getitem__(self, name: str) -> Photo:
         if name not in self._names:
             raise KeyError(name)
-        return read_image(self._folder / name)
+        return read_photo(self._folder / name, warn=False).image
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

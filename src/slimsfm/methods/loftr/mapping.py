@@ -7,7 +7,6 @@ References:
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,15 +17,17 @@ from jaxtyping import Float64, Int64
 
 from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
-from slimsfm.mapping.extraction import color_points, mask_of
+from slimsfm.mapping.extraction import color_points
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
 from slimsfm.mapping.reconstruction import pick_model, reconstruct
 from slimsfm.mapping.sfm import adjust, triangulate, verified_matches, write_database
+from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.methods.loftr.cells import (
     CellKeypoints,
     EncodedImage,
     ImageMatcher,
     Photo,
+    PhotoMask,
     in_tiles,
     match_without_keypoints,
 )
@@ -226,7 +227,7 @@ def build_without_keypoints(
     workspace: Path,
     *,
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None = None,
-    masks: Path | None = None,
+    masks: Mapping[str, PhotoMask] | None = None,
     number: int = 1,
     seed: int = 0,
     progress: ProgressBar = silent,
@@ -240,22 +241,20 @@ def build_without_keypoints(
         cameras: Intrinsics by image name; images with equal `camera_id` share a camera.
         workspace: Folder for intermediate files.
         cam_from_world: Known poses by image name; then poses and cameras are not refined.
-        masks: Folder of masks; cells where a mask is black are not matched.
+        masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
         number: Which model to keep if there are several, from 1, the largest.
         seed: Seed of all random choices.
         progress: Progress callback.
 
     Raises:
-        InputError: A photo or a mask cannot be used, or there are fewer models.
+        InputError: A photo cannot be used, or there are fewer models.
         ReconstructionError: No model can be reconstructed from the photos.
     """
-    read = {name: mask_of(masks, name, photos[name].shape[:2]) for name in photos} if masks else {}
-    masked = {name: mask for name, mask in read.items() if mask is not None}
-    cells = match_without_keypoints(photos, pairs, matcher, masked, progress)
+    cells = match_without_keypoints(photos, pairs, matcher, masks, progress)
     rough, notes, matches = _reconstruct(cells, cameras, cam_from_world, workspace, number, seed, progress)
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
     if cam_from_world is None:
-        _adjust(refined.model)
+        _adjust(refined.model, max(1.0, float(np.median(list(cells.cell_px.values()))) / _CELL_PX))
     seen = refined.features.items()
     color_points(refined.model, {name: image_colors(photos[name], one.keypoints) for name, one in seen})
     return KeypointFreeModel(
@@ -278,11 +277,11 @@ def _reconstruct(
     """
     names, database = sorted(cells.features), workspace / "database.db"
     factors = {name: cells.cell_px[name] / _CELL_PX for name in names}
-    small = {name: _scaled(cameras[name], 1 / factors[name]) for name in names}
+    shrunk = ShrunkImages(whole=cells.features, whole_cameras=cameras, factors=factors)
+    small = shrunk.cameras
     for camera in small.values():
         camera.has_prior_focal_length |= cam_from_world is not None
-    coarse = {name: _shrunk(cells.features[name], factors[name]) for name in names}
-    write_database(database, coarse, small)
+    write_database(database, shrunk.features, small)
     verify_pairs(database, names, cells.matches, seed=seed, progress=progress)
     notes: tuple[str, ...] = ()
     if cam_from_world is not None:
@@ -291,47 +290,19 @@ def _reconstruct(
         models = reconstruct(database, names, workspace / "sfm", seed=seed, progress=progress)
         model, notes = pick_model(models, number)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    _enlarge(model, cells, factors, cameras, exact=cam_from_world is not None)
+    shrunk.enlarge(model, known_cameras=cam_from_world is not None)
     return model, notes, matches
 
 
-def _scaled(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera:
-    """The camera of the image after scaling it by a factor."""
-    scaled, params = copy(camera), camera.params.copy()
-    params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] *= factor
-    scaled.params = params.tolist()
-    scaled.width, scaled.height = round(camera.width * factor), round(camera.height * factor)
-    return scaled
+def _adjust(model: pycolmap.Reconstruction, scale_px: float) -> None:
+    """Adjust poses and focal lengths, which were estimated from the less exact cells.
 
-
-def _shrunk(features: Features, factor: float) -> Features:
-    return replace(features, keypoints=(features.keypoints / factor).astype(np.float32))
-
-
-def _enlarge(
-    model: pycolmap.Reconstruction,
-    cells: CellKeypoints,
-    factors: Mapping[str, float],
-    cameras: Mapping[str, pycolmap.Camera],
-    *,
-    exact: bool,
-) -> None:
-    """Scale a model from small images to the photos; with `exact`, it gets the given cameras unchanged."""
-    names = {image.camera_id: image.name for image in model.images.values()}
-    for camera_id, name in sorted(names.items()):
-        camera = model.camera(camera_id)
-        whole = cameras[name] if exact else _scaled(camera, factors[name])
-        camera.params = whole.params.tolist()
-        camera.width, camera.height = cameras[name].width, cameras[name].height
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        for point, xy in zip(image.points2D, cells.features[image.name].keypoints, strict=True):
-            point.xy = xy.astype(np.float64)
-
-
-def _adjust(model: pycolmap.Reconstruction) -> None:
-    """Adjust poses and focal lengths, which were estimated from the less exact cells."""
+    Args:
+        model: The model.
+        scale_px: Errors beyond it count less.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale_px
     adjust(model, options)
     model.update_point_3d_errors()
