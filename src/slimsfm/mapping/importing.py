@@ -13,6 +13,8 @@ from slimsfm.mapping.agreement import Masks, counted, place_features, positions
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, estimate_box, read_box, read_model
+from slimsfm.mapping.pairs import Matches
+from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.reprojection import check_reprojection
 from slimsfm.mapping.resemblance import check_descriptors
 from slimsfm.mapping.sources import (
@@ -110,13 +112,15 @@ def import_colmap(
         box=given_box or estimate_box(model),
         box_source="given" if given_box else "estimated",
         origin=f"imported COLMAP model with descriptors from {source.origin}",
+        quality=_quality(model, matches) if matches else None,
         notes=(*notes, *source.notes, *more, *left_out),
     )
-    if matches:
-        quality = measure(model, matches, [image.name for image in model.images.values()])
-        origins = dict.fromkeys(quality.focal_lengths, "model")
-        info = replace(info, quality=replace(quality, focal_origins=origins))
     return with_global_descriptors(Map(model=model, features=features, matches=matches, info=info))
+
+
+def _quality(model: pycolmap.Reconstruction, matches: Matches) -> ModelQuality:
+    quality = measure(model, matches, [image.name for image in model.images.values()])
+    return replace(quality, focal_origins=dict.fromkeys(quality.focal_lengths, "model"))
 
 
 def _find_source(

@@ -11,12 +11,11 @@ from slimsfm.errors import ModelError
 from slimsfm.features import Features
 from slimsfm.mapping.agreement import Masks
 from slimsfm.mapping.model import camera_of
+from slimsfm.mapping.pairs import Matches
 from slimsfm.mapping.sources import Source
 
 _MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
 _MAX_EPIPOLAR_ERROR_PX = 4.0
-
-Matches = dict[tuple[str, str], IndexPairs]
 
 
 def usable_matches(
@@ -37,7 +36,7 @@ def usable_matches(
         ModelError: A match refers to a keypoint that does not exist, or no pair fits the poses.
     """
     by_name = {image.name: image for image in images if image.num_points2D()}
-    found: Matches = {}
+    found: dict[tuple[str, str], IndexPairs] = {}
     for a, b in source.matches:
         if a not in by_name or b not in by_name or (b, a) in found:
             continue
