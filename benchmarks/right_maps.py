@@ -3,8 +3,8 @@
     python benchmarks/right_maps.py -o /tmp/right --photos DIR --other DIR
 
 Renders the look-alike scenes. Makes mixtures, brackets, zooms and others from half of the photos that are
-given, with a map of all of them as the truth. Prints, for each scene, how many images are registered, how many
-of those are right (rotation within 5 degrees, relative to the other images), and the time.
+given, with a map of all of them as the truth. Prints, for each scene, how many images are registered, how
+many of those are right (rotation within 5 degrees, relative to the other images), and the time.
 """
 
 import argparse

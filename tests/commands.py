@@ -37,3 +37,16 @@ def contents(folder: Path) -> dict[str, bytes | None]:
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
     }
+
+
+def state(folder: Path) -> dict[str, tuple[int, int, bytes | None]]:
+    """All paths in a folder, and the folder itself, with times and modes; files with their bytes."""
+    paths = [folder, *sorted(folder.rglob("*"))]
+    return {
+        str(path.relative_to(folder)): (
+            path.stat().st_mtime_ns,
+            path.stat().st_mode,
+            path.read_bytes() if path.is_file() else None,
+        )
+        for path in paths
+    }

@@ -92,5 +92,16 @@ def algorithm_1(map_: Map) -> ReferenceGraph:
     return compute_graph(map_, ALGORITHM_1).graph
 
 
+def like_sift(map_: Map) -> Map:
+    """The same map with descriptors that could be SIFT's: 128 bytes. Those of a point stay equal."""
+
+    def changed(features: Features) -> Features:
+        signed = np.pad(features.descriptors, ((0, 0), (0, 64 - features.descriptors.shape[1])))
+        parts = np.concatenate([np.maximum(signed, 0), np.maximum(-signed, 0)], axis=1)
+        return replace(features, descriptors=np.round(255 * parts).astype(np.uint8))
+
+    return replace(map_, features={name: changed(one) for name, one in map_.features.items()})
+
+
 def _unit(rows: np.ndarray) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)

@@ -2,6 +2,7 @@ import pycolmap
 import pytest
 
 from commands import contents, slimsfm
+from scenes import like_sift
 from slimsfm.mapping.io import write_map
 
 
@@ -34,8 +35,9 @@ def test_a_slim_map_is_exported_with_the_pairs_of_its_queries(map_path, queries,
     assert not (out / "pairs-queries.txt").exists()
 
 
-def test_an_exported_map_can_be_imported_again(map_path, tmp_path):
-    out, back = tmp_path / "out", tmp_path / "back"
+def test_an_exported_map_can_be_imported_again(exact, tmp_path):
+    map_path, out, back = (tmp_path / name for name in ("map", "out", "back"))
+    write_map(like_sift(exact), map_path)
     assert slimsfm("export", "hloc", map_path, "-o", out).code == 0
     files = ("--features", out / "features.h5", "--matches", out / "matches.h5")
     outcome = slimsfm("import", out / "sfm", "-o", back, *files)

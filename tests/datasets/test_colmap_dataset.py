@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenes import exact_map, with_matches
+from scenes import exact_map, like_sift, with_matches
 from slimsfm.datasets.base import map_object
 from slimsfm.datasets.reconstructed import Colmap
 from slimsfm.errors import ImageError, InputError, ModelError
@@ -16,7 +16,7 @@ from slimsfm.mapping.map import check_map
 
 @pytest.fixture
 def truth():
-    return with_matches(exact_map(num_images=9, reach_deg=60.0))
+    return like_sift(with_matches(exact_map(num_images=9, reach_deg=60.0)))
 
 
 @pytest.fixture
@@ -42,8 +42,7 @@ def write_database(path, map_):
             database.write_image(row, use_image_id=True)
             database.write_keypoints(image.image_id, map_.features[name].keypoints)
             descriptors = pycolmap.FeatureDescriptors(
-                type=pycolmap.FeatureExtractorType.SIFT,
-                data=np.zeros((len(map_.features[name]), 128), np.uint8),
+                type=pycolmap.FeatureExtractorType.SIFT, data=map_.features[name].descriptors
             )
             database.write_descriptors(image.image_id, descriptors)
 

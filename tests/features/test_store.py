@@ -4,7 +4,14 @@ import pytest
 
 from slimsfm.errors import InputError
 from slimsfm.features import Features
-from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
+from slimsfm.features.store import (
+    FeatureFile,
+    FeatureWriter,
+    MatchFile,
+    indistinct_names,
+    stored_name,
+    write_matches,
+)
 
 NAMES = ["a b.png", "cam-1/x.png", "cam/1/ä y.png", "z.jpg"]
 
@@ -172,3 +179,55 @@ def test_damaged_matches_are_named(tmp_path):
     read = MatchFile(tmp_path / "matches.h5", ["a.png", "b.png"])
     with pytest.raises(InputError, match=r"matches of \('a\.png', 'b\.png'\) are damaged"):
         read["a.png", "b.png"]
+
+
+SPELLINGS = ["/abs/x.jpg", "./x.jpg", "a//x.jpg", "b/./x.jpg", "plain.jpg"]
+
+
+def test_names_that_hdf5_spells_otherwise_come_back(tmp_path):
+    features = {name: random_features(seed) for seed, name in enumerate(SPELLINGS)}
+    write(tmp_path / "features.h5", features)
+    read = FeatureFile(tmp_path / "features.h5", SPELLINGS)
+    assert list(read) == sorted(SPELLINGS)
+    for name, one in features.items():
+        assert name in read
+        assert read.count(name) == len(one)
+        assert np.array_equal(read[name].keypoints, one.keypoints)
+    assert list(FeatureFile(tmp_path / "features.h5")) == sorted(map(stored_name, SPELLINGS))
+    counts = dict.fromkeys(SPELLINGS, 7)
+    matches = {(SPELLINGS[0], SPELLINGS[1]): np.array([[1, 2], [3, 0]])}
+    write_matches(tmp_path / "matches.h5", matches, counts)
+    assert np.array_equal(
+        MatchFile(tmp_path / "matches.h5", SPELLINGS)[next(iter(matches))], [[1, 2], [3, 0]]
+    )
+
+
+def test_matches_tell_names_apart_that_hloc_does_not(tmp_path):
+    names = ["a-b.png", "a/b.png", "a-b/c.png", "a/b/c.png", "a/b-c.png"]
+    assert indistinct_names(names) == ["a/b-c.png", "a/b.png", "a/b/c.png"]
+    assert indistinct_names(NAMES) == []
+    pairs = [(a, b) for a in names for b in names if a < b]
+    matches = {pair: np.array([[i, i]]) for i, pair in enumerate(pairs)}
+    write_matches(tmp_path / "matches.h5", matches, dict.fromkeys(names, len(pairs)))
+    read = MatchFile(tmp_path / "matches.h5", names[::-1])
+    assert {pair: read[pair].tolist() for pair in read} == {pair: [[i, i]] for i, pair in enumerate(pairs)}
+
+
+def test_old_names_of_pairs_are_read(tmp_path):
+    names = ["db_1/a.png", "db_1_a.png", "q_.png", "z.png"]
+    pairs = [(a, b) for a in names for b in names if a < b]
+    with h5py.File(tmp_path / "matches.h5", "w") as file:
+        for i, (a, b) in enumerate([*pairs, ("other_a.png", "z.png")]):
+            targets = np.full(9, -1)
+            targets[i % 9] = 3
+            file[f"{a.replace('/', '-')}_{b.replace('/', '-')}/matches0"] = targets
+    read = MatchFile(tmp_path / "matches.h5", names)
+    assert {pair: read[pair].tolist() for pair in read} == {pair: [[i, 3]] for i, pair in enumerate(pairs)}
+    assert read.num_other_pairs == 1
+
+
+def test_a_pair_that_can_be_read_in_two_ways_is_no_pair(tmp_path):
+    with h5py.File(tmp_path / "matches.h5", "w") as file:
+        file["a_b_c/matches0"] = np.array([0])
+    assert list(MatchFile(tmp_path / "matches.h5", ["a", "b_c"])) == [("a", "b_c")]
+    assert list(MatchFile(tmp_path / "matches.h5", ["a", "b_c", "a_b", "c"])) == []

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pycolmap
 import pytest
 
 from scenes import camera
+from slimsfm.errors import MapError
 from slimsfm.geometry import corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import scaled_camera
@@ -34,6 +37,17 @@ def test_a_given_camera_overrides_the_one_of_the_map(boulder):
     truth = map_.images[path.name].cam_from_world()
     found = Localizer(map_).localize(read_image(path), wrong).pose.cam_from_world
     assert corner_error(found, truth, map_.box) > 0.1
+
+
+@pytest.mark.parametrize("strategy", ["exhaustive", "direct"])
+@pytest.mark.parametrize("length", [16, 64])
+def test_descriptors_of_another_length_than_the_maps_are_an_error(exact, strategy, length):
+    query = exact.features["001.png"]
+    changed = replace(query, descriptors=np.resize(query.descriptors, (len(query), length)))
+    localizer = Localizer(exact, LocalizationOptions(strategy=strategy))
+    with pytest.raises(MapError, match=f"map's descriptors have 32 values, those of .*'sift' {length}"):
+        localizer.localize_features(changed, camera())
+    assert localizer.localize_features(query[np.arange(0)], camera()).pose is None
 
 
 @pytest.mark.parametrize("shape", [(640, 480, 3), (480, 480, 3)], ids=str)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes import BOX, camera, poses
 from slimsfm.errors import InputError
-from slimsfm.geometry import project
+from slimsfm.geometry import Box, project
 from slimsfm.mapping.model import estimate_box, read_box
 
 
@@ -25,6 +25,14 @@ def test_a_box_is_read_in_every_form(tmp_path, form):
         write_json(path, corners.tolist() if form == "list" else {"corners": corners.tolist()})
     read = read_box(path).corners
     assert np.array(sorted(read.round(9).tolist())) == pytest.approx(np.array(sorted(BOX.corners.tolist())))
+
+
+@pytest.mark.parametrize("name", ["box3d_corners.txt", "box.json"])
+def test_a_box_may_start_with_a_byte_order_mark(tmp_path, name):
+    rows = BOX.corners.tolist()
+    text = json.dumps(rows) if name == "box.json" else "\n".join(" ".join(map(str, row)) for row in rows)
+    (tmp_path / name).write_text(text, "utf-8-sig")
+    assert np.array_equal(read_box(tmp_path / name).corners, Box.from_corners(BOX.corners).corners)
 
 
 SEVEN = BOX.corners[:7].tolist()

@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 
 from commands import contents
+from scenes import like_sift
 from slimsfm.errors import InputError, MapError, OutputError
 from slimsfm.features import unit_rows
 from slimsfm.features.store import FeatureFile
@@ -157,15 +158,16 @@ def test_floats_stay_as_they_are(exported):
             assert np.array_equal(file[name]["descriptors"][()].T, features.descriptors)
 
 
-def test_importing_the_export_restores_the_map(exported):
-    map_, path = exported.map, exported.path
+def test_importing_the_export_restores_the_map(exact, tmp_path):
+    map_, path = renamed(like_sift(exact), NAMES), tmp_path / "out"
+    write_hloc(map_, path)
     files = ImportOptions(features=path / "features.h5", matches=path / "matches.h5")
     back = import_colmap(path / "sfm", options=files)
     for (a, b), pairs in map_.matches.items():
         assert np.array_equal(back.matches[a, b], pairs)
     for name, features in map_.features.items():
         assert np.allclose(back.features[name].keypoints, features.keypoints, atol=1e-4)
-        assert np.array_equal(back.features[name].descriptors, features.descriptors)
+        assert np.allclose(back.features[name].descriptors, unit_rows(features.descriptors), atol=1e-3)
     boxed = replace(back, info=replace(back.info, box=map_.box))  # hloc stores no box
     assert boxed.fingerprint == map_.fingerprint
 
@@ -251,6 +253,13 @@ def test_pairs_that_hloc_would_misread_are_refused(exact, tmp_path):
     assert contents(tmp_path) == {}
 
 
+def test_names_that_hloc_takes_for_one_are_refused(exact, tmp_path):
+    names = ["a-b.png", "a/b.png", *NAMES[2:]]
+    with pytest.raises(InputError, match=r"'a/b\.png': hloc's matches cannot tell this name from another"):
+        write_hloc(renamed(exact, names), tmp_path / "out")
+    assert contents(tmp_path) == {}
+
+
 def test_a_missing_part_leaves_nothing_behind(exact, tmp_path):
     short = replace(exact, features={**exact.features, "003.png": exact.features["003.png"][np.arange(9)]})
     with pytest.raises(MapError, match=r"'003\.png' has \d+ keypoints in the model but 9 in the features"):
@@ -285,6 +294,8 @@ def test_names_of_queries_are_read_from_folders_and_lists(tmp_path):
     names = tmp_path / "names.txt"
     names.write_text("# queries\nnight/a.png\n\nb.jpg\nb.jpg\n")
     assert read_query_names(names) == ["night/a.png", "b.jpg"]
+    names.write_text("night/a.png\n", "utf-8-sig")
+    assert read_query_names(names) == ["night/a.png"]
     names.write_text(
         "night/a.png SIMPLE_RADIAL 640 480 500 320 240 0.1\nb.jpg PINHOLE 640 480 500 500 320 240\n"
     )

@@ -1,7 +1,7 @@
 import shutil
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -158,7 +158,7 @@ def test_a_database_of_other_images_is_a_model_error(editable, posed):
     path.unlink()
     with pycolmap.Database.open(path) as database:
         database.write_camera(posed.map.shared_camera)
-    with pytest.raises(ModelError, match=r"database\.db: has no descriptors of image 'take 1/frame 0\.png'"):
+    with pytest.raises(ModelError, match=r"database\.db: has no features of all 8 images of the model"):
         import_colmap(editable.model)
 
 
@@ -177,7 +177,9 @@ def test_features_of_another_run_are_a_model_error(editable):
         import_colmap(editable.model, options=ImportOptions(features=path))
     with h5py.File(path, "r+") as file:
         del file["take 1/frame 3.png"]
-    with pytest.raises(ModelError, match=r"features\.h5: has no features of image 'take 1/frame 3\.png'"):
+    with pytest.raises(
+        ModelError, match=r"features\.h5: has no features of 1 image \('take 1/frame 3\.png'\)"
+    ):
         import_colmap(editable.model, options=ImportOptions(features=path))
 
 
@@ -240,6 +242,71 @@ def test_images_that_are_missing_or_of_another_size_are_named(project, rendered,
         import_colmap(project.model, options=ImportOptions(images=folder))
     with pytest.raises(InputError, match="no such folder of images"):
         import_colmap(project.model, options=ImportOptions(images=tmp_path / "missing"))
+
+
+def resized(rendered, folder, factors):
+    """A copy of the images whose sides are multiplied by factors."""
+    for name in rendered.names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        size = tuple(round(side * factor) for side, factor in zip((320, 240), factors, strict=True))
+        Image.fromarray(read_image(rendered.folder / name)).resize(size).save(folder / name)
+    return ImportOptions(images=folder)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 0.703])
+def test_images_that_all_were_resized_alike_are_described(project, posed, rendered, tmp_path, factor):
+    map_ = import_colmap(project.model, options=resized(rendered, tmp_path / "images", (factor, factor)))
+    described, note = map_.info.notes
+    assert "keypoints that see a point; the others match nothing" in described
+    assert f"images: the images are {factor:.3g} times as large as those of the model" in note
+    for name, one in posed.map.features.items():
+        assert np.array_equal(map_.features[name].keypoints, one.keypoints)
+        assert map_.features[name].image_size == (320, 240)
+    if factor == 0.5:
+        assert poses_of_queries(map_) == pytest.approx(poses_of_queries(posed.map), abs=0.05)
+
+
+@pytest.mark.parametrize("factors", [(0.5, 0.6), (1.0, 0.9), (1.02, 1.02)])
+def test_images_of_other_proportions_are_an_error_that_names_the_ratio(project, rendered, tmp_path, factors):
+    with pytest.raises(ImageError, match=r"frame 0\.png.* times the width, .* times the height") as error:
+        import_colmap(project.model, options=resized(rendered, tmp_path / "images", factors))
+    assert f"{round(320 * factors[0]) / 320:.4g} times the width" in str(error.value)
+
+
+def test_images_resized_by_different_factors_are_an_error(project, rendered, tmp_path):
+    options = resized(rendered, tmp_path / "images", (0.5, 0.5))
+    path = tmp_path / "images" / rendered.names[5]
+    Image.fromarray(read_image(rendered.folder / rendered.names[5])).resize((240, 180)).save(path)
+    with pytest.raises(ImageError, match=r"frame 5\.png: 240x180 pixels.*\(0\.75 times"):
+        import_colmap(project.model, options=options)
+
+
+def swap(folder, names):
+    first, second = (folder / name for name in (names[1], names[6]))
+    one, other = first.read_bytes(), second.read_bytes()
+    first.write_bytes(other)
+    second.write_bytes(one)
+    return [names[1], names[6]]
+
+
+def turn(folder, names):
+    for name in names[::3]:
+        Image.fromarray(read_image(folder / name)[::-1, ::-1]).save(folder / name)
+    return names[::3]
+
+
+def mirror(folder, names):
+    Image.fromarray(read_image(folder / names[2])[:, ::-1]).save(folder / names[2])
+    return names[2:3]
+
+
+@pytest.mark.parametrize("change", [swap, turn, mirror])
+def test_photos_that_are_not_the_models_are_all_named(project, rendered, tmp_path, change):
+    shutil.copytree(rendered.folder, tmp_path / "images")
+    wrong = change(tmp_path / "images", rendered.names)
+    with pytest.raises(ModelError) as error:
+        import_colmap(project.model, options=ImportOptions(images=tmp_path / "images"))
+    assert [name for name in rendered.names if repr(name) in str(error.value)] == sorted(wrong)
 
 
 def test_images_of_something_else_are_a_model_error(project, rendered, tmp_path):
@@ -309,3 +376,223 @@ def test_images_can_be_named_directly(project, rendered):
     assert map_.fingerprint == by_options.fingerprint
     with pytest.raises(ValueError, match="database and images: give only one"):
         import_colmap(project.model, rendered.folder, ImportOptions(database=project.folder / "database.db"))
+
+
+def all_features(path):
+    return ImportOptions(features=path / "features.h5", matches=path / "matches.h5")
+
+
+def each_group(path, change):
+    """Change the group of each image in hloc's features."""
+    with h5py.File(path / "features.h5", "r+") as file:
+        found = []
+        file.visititems(lambda name, _: found.append(name) if f"{name}/keypoints" in file else None)
+        for name in found:
+            change(file[name])
+
+
+def replace_dataset(group, name, values):
+    del group[name]
+    group[name] = values
+
+
+def pad(group, length):
+    replace_dataset(group, "descriptors", np.resize(group["descriptors"][()], (length, group["scores"].size)))
+
+
+def cut(group):
+    for part in ("keypoints", "scores", "descriptors"):
+        values = group[part][()]
+        replace_dataset(group, part, values[:, :-1] if part == "descriptors" else values[:-1])
+
+
+WRONG_FEATURES = {
+    "shorter descriptors": (lambda g: pad(g, 64), r"have 64 values.*unlike those of 'sift'.*none has such"),
+    "longer descriptors": (lambda g: pad(g, 256), r"have 256 values, none of them negative, unlike .*'sift'"),
+    "signed descriptors": (
+        lambda g: replace_dataset(g, "descriptors", g["descriptors"][()] - np.float16(0.05)),
+        r"have 128 values, some of them negative.*extractor=NAME.*aliked, disk",
+    ),
+    "no descriptors": (lambda g: g.__delitem__("descriptors"), "keypoints without descriptors"),
+    "descriptors of zeros": (
+        lambda g: replace_dataset(g, "descriptors", 0 * g["descriptors"][()]),
+        "all descriptors are zero",
+    ),
+    "a keypoint less": (
+        cut,
+        r"all 8 images of the model: image 'take 1/frame 0\.png' has \d+ keypoints in the",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG_FEATURES.values(), ids=WRONG_FEATURES.keys())
+def test_features_that_cannot_be_the_models_are_an_error(editable, change, message):
+    each_group(editable.folder, change)
+    with pytest.raises(InputError, match=message) as error:
+        import_colmap(editable.model, options=all_features(editable.folder))
+    assert str(error.value).startswith(str(editable.folder / "features.h5"))
+
+
+def test_descriptors_of_two_lengths_are_an_error(editable):
+    with h5py.File(editable.folder / "features.h5", "r+") as file:
+        pad(file["take 1/frame 2.png"], 64)
+    with pytest.raises(InputError, match=r"descriptors of different lengths \(64, 128\)"):
+        import_colmap(editable.model, options=all_features(editable.folder))
+
+
+@pytest.mark.parametrize(
+    ("extractor", "message"),
+    [
+        ("nobody", r"'nobody' is unknown; known are aliked, .*sift"),
+        ("loftr", "finds no keypoints"),
+        ("", "unknown"),
+    ],
+)
+def test_an_extractor_that_cannot_be_is_an_error(project, extractor, message):
+    options = replace(all_features(project.folder), extractor=extractor)
+    with pytest.raises(InputError, match=message):
+        import_colmap(project.model, options=options)
+    with pytest.raises(ValueError, match="needs features"):
+        ImportOptions(extractor="aliked")
+
+
+def rename_pairs(path, change):
+    with h5py.File(path / "matches.h5", "r+") as file:
+        for one in list(file):
+            for other in list(file[one]):
+                file.move(f"{one}/{other}", change(one, other))
+            del file[one]
+
+
+def test_old_names_of_pairs_give_the_same_matches(editable, project):
+    rename_pairs(editable.folder, lambda one, other: f"{one}_{other}")
+    found, expected = (
+        import_colmap(one.model, options=all_features(one.folder)) for one in (editable, project)
+    )
+    assert found.fingerprint == expected.fingerprint
+    for pair, pairs in expected.matches.items():
+        assert np.array_equal(found.matches[pair], pairs)
+
+
+def features_as_matches(path):
+    shutil.copy(path / "features.h5", path / "matches.h5")
+
+
+def matches_as_features(path):
+    shutil.copy(path / "matches.h5", path / "features.h5")
+
+
+def other_images(path):
+    rename_pairs(path, lambda one, other: f"x-{one}/x-{other}")
+
+
+def another_run(path):
+    """Matches of random keypoints."""
+    rng = np.random.default_rng(0)
+    with h5py.File(path / "matches.h5", "r+") as file:
+        for one in file.values():
+            for group in one.values():
+                targets = np.full(len(group["matches0"]), -1)
+                targets[:60] = rng.permutation(60)
+                group["matches0"][...] = targets
+
+
+WRONG_FILES = {
+    "features as matches": (features_as_matches, r"matches\.h5: holds no matches"),
+    "matches as features": (matches_as_features, r"features\.h5: holds no features"),
+    "matches of other images": (
+        other_images,
+        r"matches\.h5: none of its \d+ pairs is of two images of the model",
+    ),
+    "matches of another run": (
+        another_run,
+        r"matches\.h5: none of its \d+ pairs fits the poses of the model",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG_FILES.values(), ids=WRONG_FILES.keys())
+def test_files_that_would_give_no_match_are_an_error(editable, change, message):
+    change(editable.folder)
+    with pytest.raises(InputError, match=message):
+        import_colmap(editable.model, options=all_features(editable.folder))
+
+
+def test_pairs_that_were_left_out_are_counted(editable):
+    with h5py.File(editable.folder / "matches.h5", "r+") as file:
+        file["other.png/take 1-frame 0.png/matches0"] = np.array([0])
+        (group,) = list(file["take 1-frame 0.png"].values())[:1]
+        group["matches0"][...] = -1
+    notes = import_colmap(editable.model, options=all_features(editable.folder)).info.notes
+    assert any("matches.h5: 1 pairs are not of two images of the model" in note for note in notes)
+    assert any("pairs were left out, with fewer than 15 matches" in note for note in notes)
+
+
+def test_a_database_without_matches_is_noted(editable):
+    with closing(sqlite3.connect(editable.folder / "database.db")) as database:
+        database.execute("DELETE FROM two_view_geometries")
+        database.commit()
+    map_ = import_colmap(editable.model)
+    assert map_.matches == {}
+    assert map_.info.notes == ("database.db: holds no verified matches of these images, so the map has none",)
+
+
+def rewrite(project, change):
+    model = pycolmap.Reconstruction(project.model)
+    change(model)
+    model.write_binary(project.model)
+
+
+@pytest.mark.parametrize("observing", [False, True])
+def test_keypoints_without_a_position_match_nothing_and_are_counted(editable, observing):
+    def change(model):
+        for image in list(model.images.values())[:2]:
+            for point in list(image.points2D)[::5]:
+                if observing or not point.has_point3D():
+                    point.xy = np.array([np.nan, 4.0])
+
+    rewrite(editable, change)
+    original = pycolmap.Reconstruction(editable.model)
+    map_ = import_colmap(editable.model)
+    (note,) = map_.info.notes
+    assert "keypoints of 2 images" in note
+    assert ("and 0 observations were dropped" in note) == (not observing)
+    count = 0
+    for name, image in map_.images.items():
+        xy = np.array([point.xy for point in image.points2D])
+        old = np.array([point.xy for point in original.image(image.image_id).points2D])
+        lost = ~np.isfinite(old).all(axis=1)
+        assert np.isfinite(xy).all()
+        assert np.isfinite(map_.features[name].keypoints).all()
+        assert not map_.features[name].descriptors[lost].any()
+        assert not lost[map_.observations[name].rows].any()
+        assert not any(
+            lost[pairs[:, i]].any() for pair, pairs in map_.matches.items() for i in (0, 1) if pair[i] == name
+        )
+        count += lost.sum()
+    assert note.startswith(f"{count} keypoints")
+
+
+def test_a_model_whose_points_no_image_observes_is_a_model_error(editable):
+    def change(model):
+        for image in model.images.values():
+            for point in image.points2D:
+                point.xy = np.full(2, np.nan)
+
+    rewrite(editable, change)
+    with pytest.raises(ModelError, match="no 3D points"):
+        import_colmap(editable.model)
+
+
+@pytest.mark.parametrize(
+    "names", [("a/x.png", "a//x.png"), ("/x.png", "x.png"), ("./x.png", "/x.png"), (".", "y")]
+)
+def test_names_that_cannot_be_stored_apart_are_named(editable, names):
+    def change(model):
+        for image_id, name in enumerate(names, start=1):
+            model.image(image_id).name = name
+
+    rewrite(editable, change)
+    with pytest.raises(ModelError, match="cannot be stored") as error:
+        import_colmap(editable.model)
+    assert repr(names[0]) in str(error.value)

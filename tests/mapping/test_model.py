@@ -1,10 +1,13 @@
+import codecs
 import os
 import shutil
+import struct
 
 import numpy as np
 import pycolmap
 import pytest
 
+from commands import state
 from scenes import exact_map
 from slimsfm.errors import ModelError
 from slimsfm.mapping.model import read_model
@@ -242,8 +245,57 @@ def test_a_name_that_is_not_unicode_is_a_model_error(tmp_path):
 
 def test_a_spherical_camera_is_a_model_error(text):
     replace_word(text, "cameras", slice(1, None), ["EQUIRECTANGULAR", "640", "480", "640", "480"])
-    with pytest.raises(ModelError, match="spherical"):
+    with pytest.raises(ModelError, match=r"spherical.*cut its images into perspective ones") as error:
         read_model(text)
+    assert "export the model again" not in str(error.value)
+
+
+@pytest.mark.parametrize("parts", [*((part,) for part in PARTS), PARTS])
+def test_a_byte_order_mark_changes_nothing(text, parts):
+    expected = contents(read_model(text))
+    for part in parts:
+        path = text / f"{part}.txt"
+        path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
+    before = state(text)
+    assert contents(read_model(text)) == expected
+    assert state(text) == before
+
+
+QUATERNIONS = {"binary": ("frames.bin", 16), "old binary": ("images.bin", 12)}  # file, position of the first
+
+
+@pytest.mark.parametrize("form", QUATERNIONS)
+@pytest.mark.parametrize("length", [0.0, 1e-12, np.nan, 0.3, 1.0001, 7.0])
+def test_quaternions_may_have_any_length_but_zero(tmp_path, form, length):
+    model = small_model()
+    model.write_binary(tmp_path)
+    if form == "old binary":
+        for name in ("rigs.bin", "frames.bin"):
+            (tmp_path / name).unlink()
+    name, position = QUATERNIONS[form]
+    data = bytearray((tmp_path / name).read_bytes())
+    quaternion = length * np.array(struct.unpack_from("<4d", data, position))
+    struct.pack_into("<4d", data, position, *quaternion)
+    (tmp_path / name).write_bytes(data)
+    if length > 1e-9:
+        poses = [one.image(1).cam_from_world().matrix() for one in (read_model(tmp_path), model)]
+        assert poses[0] == pytest.approx(poses[1], abs=1e-12)
+    else:
+        with pytest.raises(ModelError, match="export the model again"):
+            read_model(tmp_path)
+
+
+@pytest.mark.parametrize("word", ["nan", "-nan", "NaN", "inf", "-inf", "Infinity"])
+def test_keypoints_of_text_models_may_be_no_number(text, word):
+    expected = contents(read_model(text))["images"][1]
+    replace_word(text, "images", 3, word, row=1)
+    replace_word(text, "images", 9, "nan inf.png")
+    name, _, _, points2D = contents(read_model(text))["images"][1]
+    assert name == "nan inf.png"
+    assert np.isnan(points2D[1][0])
+    assert points2D[1][1:] == expected[3][1][1:]
+    assert points2D[0] == expected[3][0]
+    assert points2D[2:] == expected[3][2:]
 
 
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D"])

@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slimsfm.errors import InputError
 from slimsfm.features import NearestOptions
 from slimsfm.features.registry import plugins
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
 from slimsfm.localization.localizer import supports
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategies import Direct
+from slimsfm.mapping.hloc import write_hloc
+from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.subset import direct_map
 
 METRIC = NearestOptions(max_ratio=0.99, max_distance=1.1)
@@ -21,6 +24,8 @@ class OwnExtractor:
     """An extractor of a third party."""
 
     descriptor_metric = METRIC
+    descriptor_length = 128
+    signed = True
 
 
 class Recording(Direct):
@@ -51,6 +56,23 @@ def test_a_plug_in_states_how_its_descriptors_compare(exact):
     own = replace(exact, info=replace(exact.info, extractor="own"))
     assert own.descriptor_metric == METRIC
     assert own.has_keypoints
+
+
+@pytest.mark.usefixtures("installed")
+def test_features_are_imported_by_what_a_plug_in_states(exact, tmp_path):
+    def imported(change):
+        wide = {
+            name: replace(one, descriptors=change(np.tile(one.descriptors, 4)))
+            for name, one in exact.features.items()
+        }
+        write_hloc(replace(exact, features=wide), tmp_path / "hloc", overwrite=True)
+        options = ImportOptions(features=tmp_path / "hloc" / "features.h5", extractor="own")
+        return import_colmap(tmp_path / "hloc" / "sfm", options=options)
+
+    assert imported(lambda rows: rows).info.extractor == "own"
+    for wrong in (lambda rows: rows[:, :127], np.abs):
+        with pytest.raises(InputError, match="unlike those of 'own'"):
+            imported(wrong)
 
 
 def test_a_map_of_an_extractor_that_is_not_installed_has_the_default_metric(exact):

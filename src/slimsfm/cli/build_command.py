@@ -31,7 +31,7 @@ def build_photos(
     """
     watch = Stopwatch()
     networks.apply()
-    check_output(output, images, overwrite=overwrite)
+    check_output(output, images, build.masks, build.box, overwrite=overwrite)
     made = build_map(images, build, progress=shown)
     write_map(made, output, overwrite=overwrite)
     if made.unregistered:

@@ -57,8 +57,7 @@ def export_hloc(
         overwrite: Replace an existing output.
     """
     watch = Stopwatch()
-    for source in (map, queries) if queries else (map,):
-        check_output(output, source, overwrite=overwrite)
+    check_output(output, map, queries, overwrite=overwrite)
     names = read_query_names(queries) if queries else []
     exported = read_map(map)
     write_hloc(exported, output, names, overwrite=overwrite)

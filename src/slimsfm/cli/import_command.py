@@ -23,7 +23,7 @@ def import_(
         overwrite: Replace an existing map.
     """
     watch = Stopwatch()
-    check_output(output, model, overwrite=overwrite)
+    check_output(output, model, *source.paths(model), overwrite=overwrite)
     made = import_colmap(model, options=source, progress=shown)
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")

@@ -57,8 +57,7 @@ def localize(
     """
     watch = Stopwatch()
     networks.apply()
-    for source in (map, images, *also):
-        check_output(output, source, overwrite=overwrite)
+    check_output(output, map, images, *also, camera, gravity, overwrite=overwrite)
     writer_for(output, several=bool(also))
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")

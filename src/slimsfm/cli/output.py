@@ -26,15 +26,16 @@ class _Console(Console):
 console = _Console(highlight=False, soft_wrap=True, width=_WIDTH)
 
 
-def check_output(output: Path, source: Path, *, overwrite: bool) -> None:
-    """Check, before any work is done, that an output can be written and does not replace its source.
+def check_output(output: Path, *sources: Path | None, overwrite: bool) -> None:
+    """Check, before any work is done, that an output can be written and does not replace its sources.
 
     Raises:
         OutputError: The output exists and `overwrite` is off, its folder cannot be created, or it is or
-            contains the source.
+            contains a source.
     """
-    if source.resolve().is_relative_to(output.resolve()):
-        raise OutputError(f"{output}: is or contains the input {source}; choose another output")
+    for source in sources:
+        if source is not None and source.resolve().is_relative_to(output.resolve()):
+            raise OutputError(f"{output}: is or contains the input {source}; choose another output")
     check_writable(output, overwrite=overwrite)
 
 

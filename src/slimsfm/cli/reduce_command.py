@@ -135,7 +135,7 @@ def reduce(
         overwrite: Replace an existing output.
     """
     watch = Stopwatch()
-    check_output(output, map, overwrite=overwrite)
+    check_output(output, map, choosing.image_choice.graph, overwrite=overwrite)
     full, options = read_reducible(map), choosing.options
     reduced = reduce_map(full, options, graph=kept_graph(map, execution), progress=shown)
     write_map(reduced.map, output, overwrite=overwrite)

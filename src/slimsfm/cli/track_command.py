@@ -53,8 +53,7 @@ def track(
     if localization.focal != "known":
         raise InputError("tracking needs a known focal length; use `focal='known'` and `camera=FILE`")
     for path in (output, video) if video else (output,):
-        for made_of in (map, Path(source)):
-            check_output(path, made_of, overwrite=overwrite)
+        check_output(path, map, Path(source), camera, overwrite=overwrite)
     writer_for(output)
     if video:
         check_format(video)

@@ -96,7 +96,9 @@ class Colmap:
     """Box of the object: JSON or OnePose's box3d_corners.txt; estimated by default."""
 
     def __post_init__(self) -> None:
-        ImportOptions(database=self.database, features=self.features, matches=self.matches)
+        ImportOptions(
+            database=self.database, features=self.features, matches=self.matches, extractor=self.extractor
+        )
 
     def names(self) -> tuple[str, ...]:
         """The only object, named after the folder of the project or, without one, of the model."""

@@ -3,7 +3,7 @@
 Entries hold import paths, not classes: naming a method does not import what the method needs.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -30,24 +30,36 @@ class ExtractorEntry:
     has_keypoints: bool = True
     """Whether the extractor finds keypoints; otherwise images are matched as a whole."""
 
+    descriptor_length: int | None = None
+    """Number of values of a descriptor; None if unknown."""
+
+    signed: bool | None = None
+    """Whether descriptors have negative values; None if unknown."""
+
 
 EXTRACTORS = {
     "aliked": ExtractorEntry(
         path="slimsfm.methods.aliked:Aliked",
         descriptor_metric=NearestOptions(max_ratio=0.95, max_distance=0.9),
+        descriptor_length=128,
+        signed=True,
     ),
     "disk": ExtractorEntry(
         path="slimsfm.methods.disk:Disk",
         descriptor_metric=NearestOptions(max_ratio=0.95, max_distance=0.9),
+        descriptor_length=128,
+        signed=True,
     ),
     "loftr": ExtractorEntry(path="slimsfm.methods.loftr.extractor:DetectorFree", has_keypoints=False),
-    "sift": ExtractorEntry(path="slimsfm.features.sift:Sift"),
+    "sift": ExtractorEntry(path="slimsfm.features.sift:Sift", descriptor_length=128, signed=False),
     "superpoint": ExtractorEntry(
         path="slimsfm.methods.superpoint:SuperPoint",
         descriptor_metric=NearestOptions(max_ratio=0.95, max_distance=0.8),
+        descriptor_length=256,
+        signed=True,
     ),
 }
-"""Built-in extractors. The class of a plug-in may have attributes `descriptor_metric` and `has_keypoints`."""
+"""Built-in extractors. The class of a plug-in may have attributes named as the fields of `ExtractorEntry`."""
 
 MATCHERS = {
     "lightglue": "slimsfm.methods.lightglue:LightGlue",
@@ -104,6 +116,16 @@ def finds_keypoints(extractor: str) -> bool:
     return _entry(extractor).has_keypoints
 
 
+def extractor_entry(extractor: str) -> ExtractorEntry:
+    """What is known about an extractor.
+
+    Raises:
+        InputError: The name is unknown, or a package that a plug-in needs is missing.
+    """
+    _check_known("extractor", extractor, EXTRACTORS)
+    return _entry(extractor)
+
+
 def _entry(extractor: str) -> ExtractorEntry:
     if extractor in EXTRACTORS:
         return EXTRACTORS[extractor]
@@ -112,9 +134,8 @@ def _entry(extractor: str) -> ExtractorEntry:
         return ExtractorEntry(path="")
     with importing(f"extractor {extractor!r}"):
         plugin = load_object(path)
-    stated = {
-        key: getattr(plugin, key) for key in ("descriptor_metric", "has_keypoints") if hasattr(plugin, key)
-    }
+    facts = ("descriptor_metric", "has_keypoints", "descriptor_length", "signed")
+    stated = {key: getattr(plugin, key) for key in facts if hasattr(plugin, key)}
     return ExtractorEntry(path=path, **stated)
 
 
@@ -130,14 +151,19 @@ def load_method(kind: str, registry: dict[str, str], name: str, options: dict | 
     Raises:
         InputError: The name or an option is unknown, or a package that the method needs is missing.
     """
+    _check_known(kind, name, registry)
     known = {**plugins(kind), **registry}
-    if name not in known:
-        raise InputError(f"{kind} {name!r} is unknown; known are {', '.join(sorted(known))}")
     try:
         with importing(f"{kind} {name!r}"):
             return load_object(known[name])(**(options or {}))
     except (TypeError, ValueError) as error:
         raise InputError(f"{kind} {name!r}: {error}") from error
+
+
+def _check_known(kind: str, name: str, builtin: Collection[str]) -> None:
+    known = {*plugins(kind), *builtin}
+    if name not in known:
+        raise InputError(f"{kind} {name!r} is unknown; known are {', '.join(sorted(known))}")
 
 
 def export_method(method: str, path: Path, *, overwrite: bool = False) -> None:

@@ -4,17 +4,18 @@
 `image_size` (2), and if the detector estimates them `scales` (n) and `oris` (n). `oris` are in radians;
 hloc's own are in degrees and recognized by values larger than a full turn.
 `matches.h5`: one group `A/B` per pair of image names ("/" in a name becomes "-") with `matches0` (for each
-keypoint of A its match in B or -1) and `matching_scores0`.
+keypoint of A its match in B or -1) and `matching_scores0`. Old files of hloc call the group `A_B`, which is
+read as well. Names that differ in "/" and "-" alone get different ends, which hloc does not know.
+
+HDF5 takes a name for a path: `/a.jpg`, `./a.jpg` and `a.jpg` are the same group.
 
 hloc puts the center of the top-left pixel at (0, 0), everything else in slimsfm at (0.5, 0.5). Only this
 module converts.
 """
 
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from io import FileIO
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -23,10 +24,8 @@ from jaxtyping import Float32, Integer
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features.base import Features
+from slimsfm.features.hdf5 import creating, groups_with, opened, read_array
 from slimsfm.files import uninterrupted
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
 
 _PIXEL_CENTER = np.float32(0.5)
 _INT16_MAX = np.iinfo(np.int16).max
@@ -36,14 +35,18 @@ _TURN = 2 * np.pi + 0.01  # half floats round
 class FeatureFile(Mapping[str, Features]):
     """The features in a file by image name, sorted, read on access.
 
+    HDF5 forgets how a name was spelled, so that `names` gives the spelling of the images that have one.
+
     Raises:
         InputError: The file is missing or damaged, at construction; an entry is damaged, at access.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, names: Iterable[str] = ()) -> None:
         self._file = opened(path)
         self._path = path
-        self._names = dict.fromkeys(sorted(_groups_with(self._file, "keypoints")))
+        spelled = {stored_name(name): name for name in names}
+        stored = groups_with(self._file, "keypoints")
+        self._names = dict.fromkeys(sorted(spelled.get(name, name) for name in stored))
 
     def __getitem__(self, name: str) -> Features:
         if name not in self._names:
@@ -68,19 +71,15 @@ class FeatureFile(Mapping[str, Features]):
         return len(self._names)
 
 
-def read_array(file: h5py.File, name: str) -> np.ndarray:
-    """Read a dataset, five times faster than `file[name][()]`; KeyError if there is none."""
-    try:
-        found = h5py.h5d.open(file.id, name.encode())
-    except TypeError as error:
-        raise KeyError(f"{name} is not a dataset") from error
-    values = np.empty(found.shape, found.dtype)
-    found.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    return values
+def stored_name(name: str) -> str:
+    """The name under which HDF5 stores an image: without a slash at the start, empty parts and dots."""
+    return "/".join(part for part in name.split("/") if part not in ("", "."))
 
 
 def _read_features(file: h5py.File, name: str) -> Features:
     keypoints = read_array(file, f"{name}/keypoints").astype(np.float32)
+    if f"{name}/descriptors" not in file:
+        raise ValueError("keypoints without descriptors")
     descriptors = read_array(file, f"{name}/descriptors").T
     scores = read_array(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
@@ -112,7 +111,7 @@ def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, 
 class MatchFile(Mapping[tuple[str, str], IndexPairs]):
     """The verified matches in a file by pair of image names, read on access.
 
-    Each pair has one entry, in the order of names in the file.
+    Each pair has one entry, named in the order of the file. `num_other_pairs` counts pairs of other images.
 
     Raises:
         InputError: The file is missing or damaged, at construction; an entry is damaged, at access.
@@ -121,29 +120,33 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
     def __init__(self, path: Path, names: list[str]) -> None:
         self._file = opened(path)
         self._path = path
-        by_key = {_key(name): name for name in names}
-        groups = (group.split("/") for group in _groups_with(self._file, "matches0"))
-        pairs = ((by_key.get(group[0]), by_key.get(group[-1])) for group in groups)
-        self._pairs = dict.fromkeys(sorted((a, b) for a, b in pairs if a is not None and b is not None))
+        by_key = {key: name for name, key in _keys(names).items()}
+        groups = groups_with(self._file, "matches0")
+        pairs = ((_pair_of(group, by_key), group) for group in groups)
+        found = {pair: group for pair, group in pairs if pair is not None}
+        self._groups = {pair: found[pair] for pair in sorted(found)}
+        self.num_other_pairs = len(groups) - len(found)
 
     def __getitem__(self, pair: tuple[str, str]) -> IndexPairs:
-        if pair not in self._pairs:
+        if pair not in self._groups:
             raise KeyError(pair)
         try:
-            targets = read_array(self._file, f"{_key(pair[0])}/{_key(pair[1])}/matches0").astype(np.int64)
+            targets = read_array(self._file, f"{self._groups[pair]}/matches0").astype(np.int64)
+            if targets.ndim != 1:
+                raise ValueError(f"matches0 of shape {targets.shape}")
         except (KeyError, OSError, TypeError, ValueError) as error:
             raise InputError(f"{self._path}: the matches of {pair} are damaged ({error})") from error
         rows = np.flatnonzero(targets >= 0)
         return np.stack([rows, targets[rows]], axis=1)
 
     def __contains__(self, pair: object) -> bool:
-        return pair in self._pairs
+        return pair in self._groups
 
     def __iter__(self) -> Iterator[tuple[str, str]]:
-        return iter(self._pairs)
+        return iter(self._groups)
 
     def __len__(self) -> int:
-        return len(self._pairs)
+        return len(self._groups)
 
 
 class FeatureWriter:
@@ -189,6 +192,7 @@ def write_matches(
     path: Path, matches: Mapping[tuple[str, str], IndexPairs], num_keypoints: Mapping[str, int]
 ) -> None:
     """Write verified matches, in sorted order of the pairs."""
+    keys = _keys(num_keypoints)
     with creating(path) as file:
         for a, b in sorted(matches):
             pairs = matches[a, b]
@@ -196,67 +200,31 @@ def write_matches(
             targets = np.full(num_keypoints[a], -1, kind)
             targets[pairs[:, 0]] = pairs[:, 1]
             with uninterrupted():
-                _write_targets(file, f"{_key(a)}/{_key(b)}", targets)
+                _write_targets(file, f"{keys[a]}/{keys[b]}", targets)
 
 
-@contextmanager
-def creating(path: Path) -> Iterator[h5py.File]:
-    """Create an HDF5 file, or replace it; a full disk raises OSError."""
-    path.unlink(missing_ok=True)  # open readers keep the old file
-    with _PatientFile(path, "w+b") as raw:
-        file = None
-        try:
-            with uninterrupted():
-                file = h5py.File(raw, "w", libver="latest")
-            yield file
-        finally:
-            with uninterrupted():
-                if file is not None:  # a deferred interruption may arrive before the assignment
-                    file.close()
-        if raw.failure:
-            raise raw.failure
+def _keys(names: Iterable[str]) -> dict[str, str]:
+    """The keys of images in a file of matches, unique within the sorted names."""
+    keys, taken = {}, set()
+    for name in sorted(names):
+        key = name.replace("/", "-")
+        while key in taken:
+            key += "#"
+        keys[name] = key
+        taken.add(key)
+    return keys
 
 
-class _PatientFile(FileIO):
-    """Records write errors instead of raising them, because HDF5 crashes the process if the disk is full."""
-
-    failure: OSError | None = None
-
-    def write(self, data: "ReadableBuffer", /) -> int:
-        rest = memoryview(data).cast("B")
-        size = len(rest)
-        try:
-            while rest and not self.failure:
-                rest = rest[super().write(rest) :]
-        except OSError as error:
-            self.failure = error
-        return size
+def indistinct_names(names: Iterable[str]) -> list[str]:
+    """Names of images that hloc's matches do not tell apart from another name."""
+    return [name for name, key in _keys(names).items() if key != name.replace("/", "-")]
 
 
-def opened(path: Path) -> h5py.File:
-    """Open an HDF5 file for reading.
-
-    Raises:
-        InputError: The file is missing or damaged.
-    """
-    try:
-        return h5py.File(path, "r")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: not a readable HDF5 file; it may be cut short") from error
-
-
-def _groups_with(file: h5py.File, dataset: str) -> list[str]:
-    found: list[str] = []
-
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Group) and dataset in item:
-            found.append(name)
-
-    file.visititems(visit)
-    return found
-
-
-def _key(name: str) -> str:
-    return name.replace("/", "-")
+def _pair_of(group: str, by_key: Mapping[str, str]) -> tuple[str, str] | None:
+    """The images of a group `A/B`, or `A_B` in old files; None if it is not of two of these images."""
+    if "/" in group:
+        splits = [group.split("/", 1)]
+    else:
+        splits = [(group[:i], group[i + 1 :]) for i, letter in enumerate(group) if letter == "_"]
+    found = [(by_key[a], by_key[b]) for a, b in splits if a in by_key and b in by_key]
+    return found[0] if len(found) == 1 else None

@@ -32,7 +32,7 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
     """
     path = Path(path)
     try:
-        lines = [line.split() for line in path.read_text().splitlines()]
+        lines = [line.split() for line in path.read_text("utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a readable camera file ({error})") from error
     cameras = [words for words in lines if words and not words[0].startswith("#")]
@@ -137,7 +137,7 @@ def read_gravity(path: str | Path) -> dict[str, Gravity]:
     """
     path = Path(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text("utf-8-sig"))
         world = _vector(data["world"])
         return {str(name): Gravity(in_world=world, in_cam=_vector(v)) for name, v in data["images"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

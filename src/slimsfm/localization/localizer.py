@@ -8,12 +8,14 @@ import numpy as np
 import pycolmap
 
 from slimsfm.arrays import GrayImage, Image, Points2D, Points3D
+from slimsfm.errors import MapError
 from slimsfm.features import Features, load_extractor, shrink_factor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.matching import extract_near
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
+from slimsfm.mapping.descriptors import descriptor_length
 from slimsfm.mapping.map import Map
 from slimsfm.pose import Gravity, PoseEstimate, RansacOptions
 
@@ -159,6 +161,7 @@ class Localizer:
         self.options = options
         self.extractor = load_extractor(map.info.extractor, map.info.extractor_options)
         self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
+        self._length = descriptor_length(map)
         self._search = Search(map, self._strategy, options.ransac, options.focal)
 
     def localize(
@@ -256,6 +259,12 @@ class Localizer:
         )
 
     def _query(self, features: Features, camera: pycolmap.Camera, image: Image | None = None) -> Query:
+        length = features.descriptors.shape[1]
+        if len(features) and self._length not in (None, length):
+            raise MapError(
+                f"the map's descriptors have {self._length} values, those of its extractor "
+                f"{self.extractor.name!r} {length}; make the map again with the right extractor"
+            )
         order = np.argsort(-features.scores, kind="stable")
         if np.any(np.diff(order) < 0):
             features = features[order]

@@ -136,6 +136,15 @@ def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
     return np.unpackbits(packed, count=count).astype(bool)
 
 
+def descriptor_length(map: Map) -> int | None:
+    """Number of values of the map's descriptors; None if images are matched as a whole."""
+    if not map.has_keypoints:
+        return None
+    if map.point_descriptors is not None:
+        return map.point_descriptors.descriptors.shape[1]
+    return next((one.shape[1] for name in map.images if len(one := map.features[name].descriptors)), None)
+
+
 def with_global_descriptors(map: Map) -> Map:
     """Add a global descriptor per reference image to a map."""
     return replace(map, global_descriptors=describe_images(map))

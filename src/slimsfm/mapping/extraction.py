@@ -1,36 +1,24 @@
-"""Cameras, local features and colors of a folder of photos.
-
-`redescribe` computes SIFT descriptors at the keypoints of an existing model. A model stores the positions of
-keypoints but not their scales and orientations. These are taken from the nearest detected SIFT feature within
-two pixels. A keypoint without one gets a descriptor of zeros, which matches nothing.
-"""
+"""Cameras, local features and colors of a folder of photos."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 
-from slimsfm.arrays import GrayImage
-from slimsfm.errors import ImageError, InputError, ModelError
-from slimsfm.features import Extractor, Features, image_colors
-from slimsfm.features.sift import Sift, root_sift
+from slimsfm.errors import InputError
+from slimsfm.features import Extractor, image_colors
 from slimsfm.features.store import FeatureFile, FeatureWriter
 from slimsfm.mapping.masked_photos import MaskedPhotos
-from slimsfm.mapping.model import camera_of
-from slimsfm.photos import camera_from_exif, read_image
+from slimsfm.photos import camera_from_exif
 from slimsfm.progress import ProgressBar
 
 CameraSharing = Literal["auto", "shared", "per-image"]
 
 Colors = Mapping[str, UInt8[np.ndarray, "n 3"]]
 """RGB at each keypoint, by image name."""
-
-_REACH_PX = 2.0
-_MIN_DESCRIBED = 0.2  # share of observations; with fewer, detector or images are others
 
 
 def guess_cameras(images: Path, names: list[str], sharing: CameraSharing) -> dict[str, pycolmap.Camera]:
@@ -96,78 +84,3 @@ def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
     for point in model.points3D.values():
         seen = [colors[names[element.image_id]][element.point2D_idx] for element in point.track.elements]
         point.color = np.mean(seen, axis=0).round().astype(np.uint8)
-
-
-def redescribe(
-    posed_images: list[pycolmap.Image], folder: Path, progress: ProgressBar
-) -> tuple[dict[str, Features], Sift]:
-    """Describe the keypoints of a model's images by SIFT.
-
-    Returns:
-        The features by image name, and the extractor for queries.
-
-    Raises:
-        ImageError: An image is missing, unreadable or of another size than its camera.
-        ModelError: Fewer than 20 % of the keypoints that observe a point could be described.
-    """
-    extractor = Sift()
-    features = {}
-    observations = described = 0
-    for image in progress(posed_images, "describe keypoints"):
-        features[image.name] = one = _redescribe_image(image, folder / image.name, extractor)
-        seen = np.array(image.get_observation_point2D_idxs(), np.int64)
-        observations += len(seen)
-        described += int(one.descriptors[seen].any(axis=1).sum())
-    if described < _MIN_DESCRIBED * observations:
-        raise ModelError(
-            f"{folder}: SIFT features lie at only {described} of the {observations} keypoints that see a "
-            "point; give the images of this model or, if it does not use SIFT, its feature file or database"
-        )
-    return features, extractor
-
-
-def _redescribe_image(image: pycolmap.Image, path: Path, extractor: Sift) -> Features:
-    pixels = read_image(path)
-    height, width = pixels.shape[:2]
-    camera = camera_of(image)
-    if (width, height) != (camera.width, camera.height):
-        raise ImageError(
-            f"{path}: {width}x{height} pixels, but its camera in the model has "
-            f"{camera.width}x{camera.height}; give the images that the model was made from"
-        )
-    keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
-    gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    return Features(
-        keypoints=keypoints.astype(np.float32),
-        descriptors=_describe(np.asarray(gray, np.uint8), keypoints, extractor),
-        scores=np.ones(len(keypoints), np.float32),
-        image_size=(width, height),
-    )
-
-
-def _describe(
-    gray: GrayImage, keypoints: Float64[np.ndarray, "n 2"], extractor: Sift
-) -> UInt8[np.ndarray, "n 128"]:
-    detector = cv2.SIFT.create(
-        0, contrastThreshold=extractor.contrast_threshold / 2, enable_precise_upscale=True
-    )
-    descriptors = np.zeros((len(keypoints), 128), np.uint8)
-    detected = detector.detect(gray, None)
-    if not detected or not len(keypoints):
-        return descriptors
-    pixels = np.array([one.pt for one in detected]) + 0.5
-    from scipy.spatial import KDTree  # slow to import, and only needed here
-
-    distances, rows_nearest = KDTree(pixels).query(keypoints)
-    nearest = np.asarray(rows_nearest)
-    rows = np.flatnonzero(distances < _REACH_PX)
-    wanted = []
-    for row in rows:
-        one = detected[nearest[row]]
-        x, y = (keypoints[row] - 0.5).tolist()
-        # OpenCV may drop or reorder keypoints; class_id keeps the row.
-        wanted.append(cv2.KeyPoint(x, y, one.size, one.angle, one.response, one.octave, int(row)))
-    computed, found = detector.compute(gray, wanted)
-    if found is not None:
-        descriptors[[one.class_id for one in computed]] = root_sift(found)
-    return descriptors

@@ -21,7 +21,7 @@ import pycolmap
 
 from slimsfm.errors import InputError, MapError
 from slimsfm.features import Features, unit_rows
-from slimsfm.features.store import FeatureWriter, write_matches
+from slimsfm.features.store import FeatureWriter, indistinct_names, write_matches
 from slimsfm.files import replacing
 from slimsfm.image_files import list_images
 from slimsfm.mapping.map import Map, check_num_features
@@ -46,6 +46,11 @@ def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overw
         raise MapError(
             "the map is for direct matching alone, and hloc matches images; "
             "reduce the full map for images instead"
+        )
+    if indistinct := indistinct_names(map.images):
+        raise InputError(
+            f"{indistinct[0]!r}: hloc's matches cannot tell this name from another that has - instead of /; "
+            "rename the image"
         )
     pairs = _pairs(queries, map)
     with replacing(Path(path), overwrite=overwrite) as partial:
@@ -73,7 +78,7 @@ def read_query_names(path: str | Path) -> list[str]:
     if path.is_dir():
         return list_images(path)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: neither a folder of images nor a readable list of names") from error
     names = [_name(line, path) for line in lines if line.strip() and not line.startswith("#")]

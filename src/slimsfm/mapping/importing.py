@@ -1,28 +1,34 @@
 """Import COLMAP models as maps: the model does not change, its keypoints get their descriptors."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import IndexPairs
-from slimsfm.errors import InputError, ModelError
-from slimsfm.features import Features, shrink_factor
-from slimsfm.features.store import FeatureFile, MatchFile
+from slimsfm.errors import ModelError
+from slimsfm.features import Features
+from slimsfm.features.store import stored_name
+from slimsfm.mapping.agreement import Masks, counted, place_features, positions
 from slimsfm.mapping.descriptors import with_global_descriptors
-from slimsfm.mapping.extraction import redescribe
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, estimate_box, read_box, read_model
-from slimsfm.mapping.sfm import colmap_warnings, verified_matches
+from slimsfm.mapping.pairs import Matches
+from slimsfm.mapping.quality import ModelQuality
+from slimsfm.mapping.reprojection import check_reprojection
+from slimsfm.mapping.resemblance import check_descriptors
+from slimsfm.mapping.sources import (
+    Source,
+    check_extractor,
+    database_of,
+    databases_near,
+    from_database,
+    from_hloc,
+    from_images,
+)
 from slimsfm.mapping.support import measure
+from slimsfm.mapping.usable_matches import usable_matches
 from slimsfm.progress import ProgressBar, silent
-
-_MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
-_MAX_EPIPOLAR_ERROR_PX = 4.0  # in pixels in which features were found
-_LONGEST_PX = {"max_image_size": 1600}  # hloc shrinks larger images to this or less before it finds features
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +48,7 @@ class ImportOptions:
     """hloc's matches.h5; requires `features`."""
 
     extractor: str = "sift"
-    """Extractor of `features`, which is also used for queries."""
+    """Extractor of `features`, which is also used for queries. Needs `features`."""
 
     box: Path | None = None
     """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
@@ -53,17 +59,16 @@ class ImportOptions:
             raise ValueError(f"{' and '.join(given)}: give only one source of descriptors")
         if self.matches is not None and self.features is None:
             raise ValueError("matches needs features, which hold the matched keypoints")
+        if self.extractor != "sift" and self.features is None:
+            raise ValueError(
+                f"extractor={self.extractor!r} needs features; databases name theirs, and images get SIFT's"
+            )
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Source:
-    """Descriptors and, if the source has them, matches."""
-
-    features: Mapping[str, Features]
-    matches: Mapping[tuple[str, str], IndexPairs]
-    extractor: str
-    extractor_options: dict
-    origin: str
+    def paths(self, model_path: Path) -> list[Path]:
+        """The files and folders that an import of a model reads besides it."""
+        given = (self.database, self.features, self.images, self.matches, self.box)
+        found = [] if self.database or self.features or self.images else databases_near(model_path)
+        return [*(path for path in given if path), *found]
 
 
 def import_colmap(
@@ -93,194 +98,103 @@ def import_colmap(
         options = replace(options, images=Path(images))
     model = read_model(model_path)
     given_box = read_box(options.box) if options.box else None
-    if not model.num_points3D():
-        raise ModelError(f"{model_path}: the model has no 3D points; triangulate it first")
-    with colmap_warnings():
-        source = _find_source(model_path, model, options, progress)
-    _check_keypoints(model, source.features)
+    posed = _posed_images(model)
+    unusable, notes = _drop_unplaced(model, posed)
+    _check_content(model, posed, model_path)
+    notes += check_reprojection(model, posed, model_path)
+    source = _find_source(model_path, posed, options, progress)
+    check_extractor(source)
+    features, more = _fitting_features(posed, source, unusable)
+    matches, left_out = usable_matches(source, posed, features, unusable)
     info = MapInfo(
         extractor=source.extractor,
         extractor_options=source.extractor_options,
         box=given_box or estimate_box(model),
         box_source="given" if given_box else "estimated",
         origin=f"imported COLMAP model with descriptors from {source.origin}",
+        quality=_quality(model, matches) if matches else None,
+        notes=(*notes, *source.notes, *more, *left_out),
     )
-    if source.matches:
-        quality = measure(model, source.matches, [image.name for image in model.images.values()])
-        origins = dict.fromkeys(quality.focal_lengths, "model")
-        info = replace(info, quality=replace(quality, focal_origins=origins))
-    made = Map(model=model, features=source.features, matches=source.matches, info=info)
-    return with_global_descriptors(made)
+    return with_global_descriptors(Map(model=model, features=features, matches=matches, info=info))
+
+
+def _quality(model: pycolmap.Reconstruction, matches: Matches) -> ModelQuality:
+    quality = measure(model, matches, [image.name for image in model.images.values()])
+    return replace(quality, focal_origins=dict.fromkeys(quality.focal_lengths, "model"))
 
 
 def _find_source(
-    model_path: Path, model: pycolmap.Reconstruction, options: ImportOptions, progress: ProgressBar
-) -> _Source:
+    model_path: Path, images: list[pycolmap.Image], options: ImportOptions, progress: ProgressBar
+) -> Source:
     if options.features:
-        return _from_hloc(model, options)
+        return from_hloc(images, options.features, options.matches, options.extractor)
     if options.images:
-        return _from_images(model, options.images, progress)
-    database = options.database or _database_next_to(model_path)
-    return _from_database(model, database)
-
-
-def _database_next_to(model_path: Path) -> Path:
-    """Find the database as COLMAP places it: PROJECT/database.db for PROJECT/sparse/0."""
-    folders = [model_path, *model_path.absolute().parents[:2]]
-    found = [folder / "database.db" for folder in folders if (folder / "database.db").is_file()]
-    if not found:
-        raise InputError(
-            f"{model_path}: no database.db next to the model; give the source of its descriptors: "
-            "`database=FILE`, `features=FILE` (hloc) or `images=DIR`"
-        )
-    return found[0]
-
-
-def _from_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
-    if not path.is_file():
-        raise InputError(f"{path}: no such database")
-    with path.open("rb") as file:
-        header = file.read(16)
-    if header != b"SQLite format 3\0":
-        raise InputError(f"{path}: not a COLMAP database")
-    try:
-        return _read_database(model, path)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"{path}: not readable as a COLMAP database, which must be complete and writable ({error})"
-        ) from error
-
-
-def _read_database(model: pycolmap.Reconstruction, path: Path) -> _Source:
-    with pycolmap.Database.open(path) as database:
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        extractors = set()
-        features = {}
-        for image in _posed_images(model):
-            if image.name not in ids or not database.exists_descriptors(ids[image.name]):
-                raise ModelError(f"{path}: has no descriptors of image {image.name!r} of the model")
-            features[image.name], extractor = _read_database_features(database, ids[image.name], image)
-            extractors.add(extractor)
-    if len(extractors) > 1:
-        raise ModelError(f"{path}: holds features of several extractors ({', '.join(sorted(extractors))})")
-    names = {image_id: name for name, image_id in ids.items() if name in features}
-    return _Source(
-        features=features,
-        matches=verified_matches(path, names),
-        extractor=extractors.pop(),
-        extractor_options={},
-        origin="its database",
-    )
-
-
-def _read_database_features(
-    database: pycolmap.Database, image_id: int, image: pycolmap.Image
-) -> tuple[Features, str]:
-    keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
-    stored = database.read_descriptors(image_id)
-    is_sift = stored.type in (pycolmap.FeatureExtractorType.SIFT, pycolmap.FeatureExtractorType.UNDEFINED)
-    data = np.asarray(stored.data, np.uint8)
-    camera = camera_of(image)
-    features = Features(
-        keypoints=np.ascontiguousarray(keypoints[:, :2]),
-        descriptors=data if is_sift else data.view(np.float32),
-        scores=np.ones(len(keypoints), np.float32),
-        image_size=(camera.width, camera.height),
-        frames=_frames(keypoints) if is_sift else None,
-    )
-    return features, "sift" if is_sift else stored.type.name.lower().split("_")[0]
-
-
-def _frames(keypoints: Float32[np.ndarray, "n columns"]) -> Float32[np.ndarray, "n 2"] | None:
-    """Scales and orientations: the last two of four columns, or computed from the affine shapes of six."""
-    if keypoints.shape[1] == 4:
-        return keypoints[:, 2:]
-    if keypoints.shape[1] < 6:
-        return None
-    shapes = keypoints[:, 2:].reshape(-1, 2, 2)
-    scales = np.linalg.norm(shapes, axis=1).mean(axis=1)
-    return np.stack([scales, np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0])], axis=1)
-
-
-def _from_hloc(model: pycolmap.Reconstruction, options: ImportOptions) -> _Source:
-    path = options.features
-    if path is None:
-        raise ValueError("features must be given")
-    stored = FeatureFile(path)
-    features = {}
-    for image in _posed_images(model):
-        if image.name not in stored:
-            raise ModelError(f"{path}: has no features of image {image.name!r} of the model")
-        features[image.name] = stored[image.name]
-    matches = {}
-    if options.matches:
-        raw = MatchFile(options.matches, sorted(features))
-        _check_matches(options.matches, raw, features)
-        matches = _consistent_matches(model, features, raw)
-    return _Source(
-        features=features,
-        matches=matches,
-        extractor=options.extractor,
-        extractor_options={},
-        origin="hloc's features",
-    )
-
-
-def _check_matches(path: Path, matches: MatchFile, features: Mapping[str, Features]) -> None:
-    for a, b in matches:
-        limits = (len(features[a]), len(features[b]))
-        if np.any(matches[a, b] >= limits):
-            raise ModelError(f"{path}: the matches of {a!r} and {b!r} refer to a missing keypoint")
-
-
-def _consistent_matches(
-    model: pycolmap.Reconstruction, features: Mapping[str, Features], raw: MatchFile
-) -> dict[tuple[str, str], Int64[np.ndarray, "kept 2"]]:
-    """Hloc's unverified matches, filtered by the epipolar geometry of the model's poses."""
-    images = {image.name: image for image in _posed_images(model)}
-    cameras = {name: camera_of(image) for name, image in images.items()}
-    verified = {}
-    for a, b in raw:
-        pairs = raw[a, b]
-        rays = [
-            np.asarray(cameras[name].cam_from_img(features[name].keypoints[column].astype(np.float64)))
-            for name, column in ((a, pairs[:, 0]), (b, pairs[:, 1]))
-        ]
-        b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
-        essential = pycolmap.essential_matrix_from_pose(b_from_a)
-        squared = np.asarray(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
-        focal = min(
-            camera.mean_focal_length() / shrink_factor(_LONGEST_PX, camera.width, camera.height)
-            for camera in (cameras[a], cameras[b])
-        )
-        good = pairs[squared * focal**2 < _MAX_EPIPOLAR_ERROR_PX**2]
-        if len(good) >= _MIN_INLIERS:
-            verified[a, b] = good
-    return verified
-
-
-def _from_images(model: pycolmap.Reconstruction, images: Path, progress: ProgressBar) -> _Source:
-    if not images.is_dir():
-        raise InputError(f"{images}: no such folder of images")
-    features, extractor = redescribe(_posed_images(model), images, progress)
-    return _Source(
-        features=features,
-        matches={},
-        extractor=extractor.name,
-        extractor_options=extractor.options,
-        origin="its images",
-    )
+        return from_images(images, options.images, progress)
+    return from_database(images, options.database or database_of(model_path))
 
 
 def _posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
 
 
-def _check_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Features]) -> None:
-    for image in _posed_images(model):
-        count, described = image.num_points2D(), len(features[image.name])
-        if count != described:
+def _check_content(model: pycolmap.Reconstruction, images: list[pycolmap.Image], path: Path) -> None:
+    if not model.num_points3D():
+        raise ModelError(f"{path}: the model has no 3D points; triangulate it first")
+    if not model.compute_num_observations():
+        raise ModelError(
+            f"{path}: no image of the model observes a 3D point; triangulate it again with its images"
+        )
+    stored: dict[str, str] = {}
+    for name in (image.name for image in images):
+        other = stored.setdefault(stored_name(name), name)
+        if other != name or not stored_name(name):
             raise ModelError(
-                f"image {image.name!r} has {count} keypoints in the model but {described} in the features: "
-                "they belong to different runs"
+                f"{path}: the images {other!r} and {name!r} cannot be stored apart; rename one of them"
             )
+
+
+def _drop_unplaced(model: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> tuple[Masks, list[str]]:
+    """Move keypoints without a finite position, which COLMAP's undistorter leaves, to (0, 0).
+
+    Returns:
+        The mask of these keypoints by image name, and a note. They observe nothing.
+    """
+    unusable, observations = {}, 0
+    for image in images:
+        unusable[image.name] = ~np.isfinite(positions(image)).all(axis=1)
+        for row in np.flatnonzero(unusable[image.name]).tolist():
+            if image.points2D[row].has_point3D():
+                model.delete_observation(image.image_id, row)
+                observations += 1
+            image.points2D[row].xy = np.zeros(2)
+    counts = {name: int(mask.sum()) for name, mask in unusable.items() if mask.any()}
+    if not counts:
+        return unusable, []
+    note = (
+        f"{sum(counts.values())} keypoints of {counted(counts, len(images))} in the model have no finite "
+        f"position; they were moved to (0, 0) and match nothing, and {observations} observations were dropped"
+    )
+    return unusable, [note]
+
+
+def _fitting_features(
+    images: list[pycolmap.Image], source: Source, unusable: Masks
+) -> tuple[dict[str, Features], list[str]]:
+    """The features of all images, checked against the model; images without keypoints have none."""
+    with_keypoints = [image for image in images if image.num_points2D()]
+    features, notes = place_features(with_keypoints, source.features, unusable, source.path)
+    check_descriptors(with_keypoints, features, source.path)
+    width = next(iter(features.values())).descriptors
+    empty = [image for image in images if not image.num_points2D()]
+    for image in empty:
+        camera = camera_of(image)
+        features[image.name] = Features(
+            keypoints=np.zeros((0, 2), np.float32),
+            descriptors=width[:0],
+            scores=np.zeros(0, np.float32),
+            image_size=(camera.width, camera.height),
+        )
+    if empty:
+        names = [image.name for image in empty]
+        notes.append(f"{counted(names)} have no keypoints in the model and match nothing")
+    return features, notes

@@ -24,15 +24,8 @@ from jaxtyping import Float64, UInt8
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, MapError
-from slimsfm.features.store import (
-    FeatureFile,
-    FeatureWriter,
-    MatchFile,
-    creating,
-    opened,
-    read_array,
-    write_matches,
-)
+from slimsfm.features.hdf5 import creating, opened, read_array
+from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
 from slimsfm.mapping.descriptors import (
@@ -123,7 +116,9 @@ def read_map(path: str | Path) -> Map:
             path / part for part in ("matches.h5", "global.npz", "photos.h5")
         )
         features = (
-            None if direct and not (path / "features.h5").exists() else FeatureFile(path / "features.h5")
+            None
+            if direct and not (path / "features.h5").exists()
+            else FeatureFile(path / "features.h5", names)
         )
         map_ = Map(
             model=model,

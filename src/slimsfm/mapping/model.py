@@ -1,13 +1,10 @@
 """Read COLMAP models and check them; read or estimate the box of the object.
 
-pycolmap trusts the counts in a binary file: a truncated file makes it run out of memory or abort the process.
-So each binary file is first walked record by record, as COLMAP's "Output Format" describes. Damage that
-pycolmap does not notice is searched for in the model that it returns.
+Damage that pycolmap does not notice is searched for in its bytes (`mapping.binary`) and in the model that it
+returns.
 """
 
 import json
-import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +14,12 @@ from jaxtyping import Float64
 from slimsfm.arrays import Ids, Points3D
 from slimsfm.errors import InputError, ModelError
 from slimsfm.geometry import Box
+from slimsfm.mapping.binary import MODEL_PARTS, check_binary
+from slimsfm.mapping.text import read_text_model
 
-_CAMERA, _POSE, _POINT2D = 24, 56, 24  # bytes: id, model, width, height; quaternion and translation; x, y, id
-_TRACK_ELEMENT, _SENSOR, _DATA = 8, 8, 16
 _MOST_PIXELS = 1_000_000  # along a side
+_SHORTEST, _UNIT = 1e-9, 1e-9  # length of a quaternion, and how far from 1 it may be
+_AGAIN = "; export the model again"
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
@@ -38,48 +37,59 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
                 f"{path / part}{suffix}: missing; a COLMAP model has cameras, images and points3D"
             )
     if suffix == ".bin":
-        for part, walk in _WALKS.items():
-            _check_binary(path / f"{part}.bin", walk)
+        for part in MODEL_PARTS:
+            check_binary(path / f"{part}.bin")
     try:
-        model = pycolmap.Reconstruction()
-        (model.read_binary if suffix == ".bin" else model.read_text)(path)
-        if suffix == ".txt":
-            _name_images(model, path / "images.txt")
+        model = _read_binary(path) if suffix == ".bin" else read_text_model(path)
+        _normalize_rotations(model)
         fault = _fault(model)
-    except (RuntimeError, ValueError, IndexError) as error:
+    except (RuntimeError, ValueError, IndexError, OSError) as error:
         raise ModelError(f"{path}: pycolmap cannot read this model: {_first_line(error)}") from error
     if fault:
-        raise ModelError(f"{path}: {fault}; export the model again")
+        raise ModelError(f"{path}: {fault}")
     return model
 
 
-def _name_images(model: pycolmap.Reconstruction, file: Path) -> None:
-    """Set the full names of images; pycolmap reads only their first word from text."""
-    lines = iter(file.read_text().split("\n"))
-    for line in lines:
-        if line.strip() and not line.strip().startswith("#"):
-            words = line.split(maxsplit=9)
-            model.image(int(words[0])).name = words[9].strip()
-            next(lines, None)  # its keypoints
+def _read_binary(path: Path) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    model.read_binary(path)
+    return model
+
+
+def _normalize_rotations(model: pycolmap.Reconstruction) -> None:
+    """Scale quaternions to unit length, which COLMAP's format does not ask for."""
+    for frame in model.frames.values():
+        if frame.has_pose():
+            rotation = frame.rig_from_world.rotation
+            length = float(np.linalg.norm(rotation.quat))
+            if _SHORTEST < length < np.inf and abs(length - 1) > _UNIT:
+                rotation.normalize()
 
 
 def _fault(model: pycolmap.Reconstruction) -> str | None:
     """The first fault found in a model that pycolmap could read, or None."""
     if not model.num_reg_images():
-        return "the model has no image with a pose"
+        return "the model has no image with a pose; give a model with poses"
     for camera_id, camera in sorted(model.cameras.items()):
         if camera.is_spherical():
-            return f"camera {camera_id} is spherical ({camera.model_name}), which is not supported"
+            return (
+                f"camera {camera_id} is spherical ({camera.model_name}), which is not supported; cut its "
+                "images into perspective ones and reconstruct those"
+            )
         if not _is_camera(camera):
-            return f"camera {camera_id} has an impossible size or focal length"
+            return f"camera {camera_id} has an impossible size or focal length{_AGAIN}"
     if not model.is_valid() or _num_track_elements(model) != model.compute_num_observations():
-        return "its points and images do not belong together"
+        return f"its points and images do not belong together{_AGAIN}"
     if len({image.name for image in model.images.values()}) < model.num_images():
-        return "several of its images have the same name"
-    poses = [model.image(image_id).cam_from_world().matrix() for image_id in model.reg_image_ids()]
+        return f"several of its images have the same name{_AGAIN}"
+    images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
+    poses = [image.cam_from_world().matrix() for image in images]
     positions = np.array([point.xyz for point in model.points3D.values()])
     if not np.isfinite(poses).all() or not np.isfinite(positions).all():
-        return "a pose or a point in it is not finite"
+        return f"a pose or a point in it is not finite{_AGAIN}"
+    for image in images:
+        if abs(np.linalg.norm(image.cam_from_world().rotation.quat) - 1) > _UNIT:
+            return f"the quaternion of image {image.name!r} or of its rig has no direction{_AGAIN}"
     return None
 
 
@@ -108,69 +118,6 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _check_binary(file: Path, walk: "Walk") -> None:
-    if not file.is_file():
-        return  # models from before rigs and frames lack these two files
-    data = memoryview(file.read_bytes())
-    try:
-        (count,) = struct.unpack_from("<Q", data, 0)
-        position = 8
-        for _ in range(count):
-            position = walk(data, position)
-            if position > len(data):
-                raise ValueError
-    except (struct.error, ValueError, IndexError, KeyError):
-        raise ModelError(
-            f"{file}: damaged or cut short ({len(data)} bytes); copy or export the model again"
-        ) from None
-    if position != len(data):
-        raise ModelError(f"{file}: {len(data) - position} bytes too long; copy or export the model again")
-
-
-def _walk_camera(data: memoryview, position: int) -> int:
-    model = pycolmap.CameraModelId(struct.unpack_from("<i", data, position + 4)[0])
-    params = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params
-    return position + _CAMERA + 8 * len(params)
-
-
-def _walk_image(data: memoryview, position: int) -> int:
-    end = position + 4 + _POSE + 4
-    while data[end] != 0:
-        end += 1
-    (num_points2D,) = struct.unpack_from("<Q", data, end + 1)
-    return end + 9 + _POINT2D * num_points2D
-
-
-def _walk_point3D(data: memoryview, position: int) -> int:
-    (track_length,) = struct.unpack_from("<Q", data, position + 43)
-    return position + 51 + _TRACK_ELEMENT * track_length
-
-
-def _walk_rig(data: memoryview, position: int) -> int:
-    (num_sensors,) = struct.unpack_from("<I", data, position + 4)
-    position += 8 + (_SENSOR if num_sensors else 0)
-    for _ in range(num_sensors - 1):
-        position += _SENSOR + 1 + (_POSE if data[position + _SENSOR] else 0)
-    return position
-
-
-def _walk_frame(data: memoryview, position: int) -> int:
-    (num_data,) = struct.unpack_from("<I", data, position + 8 + _POSE)
-    return position + 12 + _POSE + _DATA * num_data
-
-
-Walk = Callable[[memoryview, int], int]
-"""Takes the bytes of a file and the start of a record, and returns the start of the next record."""
-
-_WALKS: dict[str, Walk] = {
-    "cameras": _walk_camera,
-    "rigs": _walk_rig,
-    "frames": _walk_frame,
-    "images": _walk_image,
-    "points3D": _walk_point3D,
-}
-
-
 _ROUNDS = 50  # of trimming; it converges in fewer
 _REACH = 2.0  # points beyond this many times the root mean square distance are background
 _SPREAD = 0.25  # of the Gaussian, over the shorter side of the image
@@ -186,10 +133,10 @@ def read_box(path: str | Path) -> Box:
     path = Path(path)
     try:
         if path.suffix.lower() == ".json":
-            data = json.loads(path.read_text())
+            data = json.loads(path.read_text("utf-8-sig"))
             corners = np.array(data["corners"] if isinstance(data, dict) else data, np.float64)
         else:
-            lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+            lines = [line.split() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
             corners = np.array(lines, np.float64)
         return Box.from_corners(corners)
     except FileNotFoundError as error:
