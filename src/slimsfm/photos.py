@@ -1,18 +1,24 @@
-"""Image files: list them, read their upright pixels, and guess their cameras from EXIF data."""
+"""Image files: list them, and read their pixels, upright or as they are stored."""
 
+import struct
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
-import pycolmap
 from jaxtyping import UInt8
-from PIL import ExifTags, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, UnidentifiedImageError
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, InputError
+
+Orientation = Literal["upright", "stored"]
+"""Which pixels of an image file: turned upright according to its EXIF orientation, or as they are stored, as
+COLMAP and hloc read them."""
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 
@@ -24,6 +30,18 @@ _UNREADABLE = (
     SyntaxError,
     RuntimeError,
 )
+
+_TURN = PillowImage.Transpose
+_UPRIGHT = {
+    2: _TURN.FLIP_LEFT_RIGHT,
+    3: _TURN.ROTATE_180,
+    4: _TURN.FLIP_TOP_BOTTOM,
+    5: _TURN.TRANSPOSE,
+    6: _TURN.ROTATE_270,
+    7: _TURN.TRANSVERSE,
+    8: _TURN.ROTATE_90,
+}  # from the stored pixels, by EXIF orientation
+_STORED = _UPRIGHT | {6: _TURN.ROTATE_90, 8: _TURN.ROTATE_270}  # from the upright pixels
 
 
 def list_images(folder: str | Path) -> list[str]:
@@ -46,21 +64,47 @@ def list_images(folder: str | Path) -> list[str]:
     return names
 
 
-def read_image(path: str | Path) -> Image:
-    """Read an image as RGB and rotate it upright according to its EXIF orientation.
+def read_image(path: str | Path, orientation: Orientation = "upright") -> Image:
+    """Read an image as RGB.
+
+    Args:
+        path: The file.
+        orientation: Whether to turn the pixels upright according to the EXIF orientation of the file.
 
     Raises:
         ImageError: The file is missing or not a complete image.
     """
-    with _reading(path), PillowImage.open(path) as file:
-        upright = ImageOps.exif_transpose(file)
-        if upright.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8 instead of scaling them
-            upright = PillowImage.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-        return np.array(upright.convert("RGB"))
+    with reading(path), PillowImage.open(path) as file:
+        tag = exif_orientation(file)
+        file.load()
+        is_upright = exif_orientation(file) != tag  # Pillow turns TIFF files itself
+        turns = {} if is_upright == (orientation == "upright") else _STORED if is_upright else _UPRIGHT
+        picture = file.transpose(turns[tag]) if tag in turns else file
+        if picture.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8 instead of scaling them
+            picture = PillowImage.fromarray((np.asarray(picture) >> 8).astype(np.uint8))
+        return np.array(picture.convert("RGB"))
+
+
+def exif_orientation(file: PillowImage.Image) -> int:
+    """The EXIF orientation of an open image file, from 1 to 8; 1, which is upright, if it has none."""
+    tag = exif_of(file).get(ExifTags.Base.Orientation, 1)
+    return tag if isinstance(tag, int) and 1 <= tag <= 8 else 1
+
+
+def exif_of(file: PillowImage.Image) -> dict[int, Any]:
+    """The EXIF data of an open image file by tag, with those of the lens; empty if they are damaged."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of damaged EXIF data
+            exif = file.getexif()
+            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except (SyntaxError, ValueError, KeyError, TypeError, struct.error):
+        return {}
 
 
 @contextmanager
-def _reading(path: str | Path) -> Iterator[None]:
+def reading(path: str | Path) -> Iterator[None]:
+    """Report a file that Pillow cannot read as an `ImageError`."""
     try:
         yield
     except FileNotFoundError as error:
@@ -76,25 +120,6 @@ def read_mask(path: str | Path) -> GrayImage:
         ImageError: The file is missing or not a complete image.
     """
     return read_image(path).max(axis=2)
-
-
-def camera_from_exif(path: str | Path) -> pycolmap.Camera:
-    """Guess the camera of an image: focal length from EXIF, or else 1.2 times the longer side.
-
-    Returns:
-        A SIMPLE_RADIAL camera of the upright image without distortion; `has_prior_focal_length` says
-        whether the focal length is from EXIF.
-
-    Raises:
-        ImageError: The file is missing or not an image.
-    """
-    with _reading(path), PillowImage.open(path) as file:
-        turned = file.getexif().get(ExifTags.Base.Orientation, 1) >= 5
-        upright_size = file.size[::-1] if turned else file.size
-        camera = pycolmap.infer_camera_from_image(path)
-    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", camera.focal_length, *upright_size)
-    guess.has_prior_focal_length = camera.has_prior_focal_length
-    return guess
 
 
 def shrink(image: UInt8[np.ndarray, "_ _ *channels"], max_size: int) -> UInt8[np.ndarray, "_ _ *channels"]:

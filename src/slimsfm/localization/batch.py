@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import pycolmap
 
@@ -14,7 +14,7 @@ from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.features import Features
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.photos import list_images, read_image
+from slimsfm.photos import Orientation, list_images, read_image
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
 
@@ -45,7 +45,7 @@ class MultiLocalizer:
         """Search one image for every object.
 
         Args:
-            image: Upright RGB.
+            image: RGB, upright or as stored as the maps say.
             cameras: Intrinsics by name of the object; where they are missing or None, those of the object's
                 map are used.
             gravity: As in `Localizer.localize`; all maps must share one frame.
@@ -173,4 +173,11 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
 def _localize_one(
     localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
 ) -> dict[str, Localization]:
-    return localizer.localize(read_image(task.path), task.cameras, gravity.get(task.name))
+    """Localize an image against all maps; it is read as each of them says."""
+    found: dict[str, Localization] = {}
+    for orientation in get_args(Orientation):
+        alike = {k: one for k, one in localizer.localizers.items() if one.map.info.orientation == orientation}
+        if alike:
+            image = read_image(task.path, orientation)
+            found |= MultiLocalizer(alike).localize(image, task.cameras, gravity.get(task.name))
+    return {key: found[key] for key in localizer.localizers}

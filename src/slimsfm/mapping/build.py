@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError
+from slimsfm.exif import Exif, ignored_values, read_exif, read_orientation
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
@@ -18,6 +20,7 @@ from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import estimate_box, read_box
+from slimsfm.mapping.orientation import turned_model, turned_pixels
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.sfm import (
     colmap_warnings,
@@ -28,7 +31,7 @@ from slimsfm.mapping.sfm import (
     verified_matches,
     write_database,
 )
-from slimsfm.photos import list_images
+from slimsfm.photos import Orientation, list_images
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -37,8 +40,12 @@ class BuildOptions:
     """How a map is built from photos."""
 
     camera: CameraSharing = "auto"
-    """Images that share a camera: all (shared), none (per-image), or images of equal size and EXIF focal
-    length (auto)."""
+    """Images that share a camera: all (shared), none (per-image), or images of equal size and, by EXIF, equal
+    focal length and device (auto). Width and height may be swapped."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the photos to map: turned upright according to EXIF, or as they are stored, as COLMAP
+    does. Queries are read alike."""
 
     pairs: PairChoice = "auto"
     """Pairs of images to match: all (exhaustive), neighbors in order of name (sequential), or images that
@@ -120,12 +127,20 @@ def build_map(
         raise InputError(f"{images}: holds {len(names)} image; a map needs at least two")
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
-    cameras = known.cameras if known else guess_cameras(images, names, options.camera)
+    exifs = {} if known else {name: read_exif(images / name) for name in names}
+    guessed = guess_cameras(exifs, options.camera, options.orientation)
     with _opened(workspace) as folder, colmap_warnings():
         work = BuildWork(
-            images=images, names=names, workspace=folder, cameras=cameras, known=known, progress=progress
+            images=images,
+            names=names,
+            workspace=folder,
+            cameras=known.cameras if known else guessed.by_name,
+            turned=guessed.turned,
+            known=known,
+            progress=progress,
         )
         if isinstance(extractor, ModelBuilder):
+            _check_not_turned(work, options)
             parts = extractor.build_model(work, options)
         else:
             parts = _parts_with_keypoints(work, extractor, options)
@@ -136,6 +151,11 @@ def build_map(
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
+        notes=ignored_values(exifs),
+        orientation=options.orientation,
+        exif_orientations=_exif_orientations(images, names, exifs)
+        if options.orientation == "upright"
+        else {},
     )
     registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     made = Map(
@@ -147,6 +167,11 @@ def build_map(
         unregistered=tuple(name for name in names if name not in registered),
     )
     return with_global_descriptors(made)
+
+
+def _exif_orientations(images: Path, names: list[str], exifs: Mapping[str, Exif]) -> dict[str, int]:
+    tags = {name: exifs[name].orientation if exifs else read_orientation(images / name) for name in names}
+    return {name: tag for name, tag in tags.items() if tag != 1}
 
 
 @contextmanager
@@ -175,6 +200,9 @@ class BuildWork:
 
     cameras: Mapping[str, pycolmap.Camera]
     """Intrinsics by image name; images with equal `camera_id` share a camera."""
+
+    turned: Mapping[str, pycolmap.Camera]
+    """Images taken with the camera of others, held turned by 90°: the camera of the others."""
 
     known: KnownPoses | None
     """Known poses, if any: then points are triangulated and nothing else is estimated."""
@@ -219,7 +247,9 @@ class ModelBuilder(Protocol):
 
 def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
-    features, colors = extract_features(work.images, names, extractor, options.masks, output, work.progress)
+    features, colors = extract_features(
+        work.images, names, extractor, options.masks, output, work.progress, options.orientation
+    )
     database, sfm = _match(work, features, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
     if work.known:
@@ -227,6 +257,8 @@ def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildO
         model = triangulate(database, names, sfm, poses, seed=seed, progress=progress)
     else:
         model = reconstruct(database, names, sfm, seed=seed, progress=progress)
+        turns_back = {image.name: -int(image.name in work.turned) for image in model.images.values()}
+        model = turned_model(model, turns_back)
     put_keypoints(model, features)
     color_points(model, colors)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
@@ -242,7 +274,8 @@ def _extractor(options: BuildOptions) -> Extractor:
 
 def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Path:
     database = work.workspace / "database.db"
-    write_database(database, features, work.cameras)
+    write_database(database, features, {**work.cameras, **work.turned})
+    _turn_keypoints(database, work)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
         match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)
@@ -251,3 +284,23 @@ def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Pat
         matches = match_pairs_with(matcher, features, pairs, work.progress)
         verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
     return database
+
+
+def _turn_keypoints(database: Path, work: BuildWork) -> None:
+    """Turn the keypoints of pictures held sideways, so that they are of the camera of the others."""
+    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+        for image in opened.read_all_images() if work.turned else []:
+            name = work.names[image.image_id - 1]
+            if name in work.turned:
+                keypoints = np.asarray(opened.read_keypoints(image.image_id), np.float64)[:, :2]
+                size = work.cameras[name].width, work.cameras[name].height
+                turned = turned_pixels(keypoints, size, 1).astype(np.float32)
+                opened.update_keypoints(image.image_id, turned)
+
+
+def _check_not_turned(work: BuildWork, options: BuildOptions) -> None:
+    if work.turned and options.camera == "shared":
+        raise InputError(
+            f"{min(work.turned)}: width and height are swapped, and without a detector such images cannot "
+            "share a camera with the others; use `camera='auto'`"
+        )

@@ -5,7 +5,9 @@ keypoints but not their scales and orientations. These are taken from the neares
 two pixels. A keypoint without one gets a descriptor of zeros, which matches nothing.
 """
 
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +18,12 @@ from jaxtyping import Float64, UInt8
 
 from slimsfm.arrays import GrayImage
 from slimsfm.errors import ImageError, InputError, ModelError
+from slimsfm.exif import Exif, read_orientation
 from slimsfm.features import Extractor, Features, image_colors
 from slimsfm.features.sift import Sift, root_sift
 from slimsfm.features.store import FeatureFile, FeatureWriter
 from slimsfm.mapping.model import camera_of
-from slimsfm.photos import camera_from_exif, read_image, read_mask
+from slimsfm.photos import Orientation, read_image, read_mask
 from slimsfm.progress import ProgressBar
 
 CameraSharing = Literal["auto", "shared", "per-image"]
@@ -32,39 +35,61 @@ _REACH_PX = 2.0
 _MIN_DESCRIBED = 0.2  # share of observations; with fewer, detector or images are others
 
 
-def guess_cameras(images: Path, names: list[str], sharing: CameraSharing) -> dict[str, pycolmap.Camera]:
-    """Guess the camera of each image from EXIF; images with equal `camera_id` share a camera.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GuessedCameras:
+    """Cameras of images, guessed from EXIF."""
 
-    With "auto", images of equal size and focal length share a camera; with "shared" all do, with "per-image"
-    none.
+    by_name: Mapping[str, pycolmap.Camera]
+    """The camera of each image in its own pixels; images with equal `camera_id` share a camera."""
+
+    turned: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
+    """Images taken with the camera of others, held turned by 90°: the camera of the others."""
+
+
+def guess_cameras(
+    exifs: Mapping[str, Exif], sharing: CameraSharing, orientation: Orientation = "upright"
+) -> GuessedCameras:
+    """Guess the camera of each image from its EXIF data, by name.
+
+    With "auto", images of equal size, focal length and device share a camera; with "shared" all do, with
+    "per-image" none. Pictures of swapped width and height are of one camera, held upright and sideways.
 
     Raises:
-        InputError: An image cannot be read, or images of different sizes share a camera.
+        InputError: Images of different sizes share a camera.
     """
-    guesses = {name: camera_from_exif(images / name) for name in names}
+    guesses = {name: exif.camera(orientation) for name, exif in exifs.items()}
     if sharing == "shared":
         _check_equal_sizes(guesses)
-    first: dict[tuple, pycolmap.Camera] = {}
+    groups: dict[tuple, list[str]] = {}
     for name, camera in guesses.items():
-        camera.camera_id = len(first) + 1
-        first.setdefault(_key(name, camera, sharing), camera)
-    return {name: first[_key(name, camera, sharing)] for name, camera in guesses.items()}
+        groups.setdefault(_key(name, exifs[name], camera, sharing), []).append(name)
+    by_name, turned = {}, {}
+    for names in groups.values():
+        first: dict[int, pycolmap.Camera] = {}  # by width
+        for name in names:
+            guesses[name].camera_id = 1 + len({camera.camera_id for camera in by_name.values()})
+            by_name[name] = first.setdefault(guesses[name].width, guesses[name])
+        widths = Counter(by_name[name].width for name in names)
+        usual = max(widths, key=lambda width: (widths[width], width))
+        turned |= {name: first[usual] for name in names if by_name[name].width != usual}
+    return GuessedCameras(by_name=by_name, turned=turned)
 
 
-def _key(name: str, camera: pycolmap.Camera, sharing: CameraSharing) -> tuple:
+def _key(name: str, exif: Exif, camera: pycolmap.Camera, sharing: CameraSharing) -> tuple:
     if sharing == "shared":
         return ()
     if sharing == "per-image":
         return (name,)
-    return (camera.width, camera.height, round(camera.focal_length, 2))
+    return (*sorted(exif.stored_size), round(camera.focal_length, 2), exif.device)
 
 
-def _check_equal_sizes(guesses: dict[str, pycolmap.Camera]) -> None:
-    sizes = {(camera.width, camera.height): name for name, camera in guesses.items()}
+def _check_equal_sizes(guesses: Mapping[str, pycolmap.Camera]) -> None:
+    sizes = {tuple(sorted((camera.width, camera.height))): name for name, camera in guesses.items()}
     if len(sizes) > 1:
-        (size_a, a), (size_b, b) = list(sizes.items())[:2]
+        a, b = (guesses[name] for name in list(sizes.values())[:2])
+        name_a, name_b = list(sizes.values())[:2]
         raise InputError(
-            f"{a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
+            f"{name_a} has {a.width}x{a.height} pixels, {name_b} {b.width}x{b.height}; "
             "images that share a camera must have the same size, so use `camera='auto'`"
         )
 
@@ -76,6 +101,7 @@ def extract_features(
     masks: Path | None,
     output: Path,
     progress: ProgressBar,
+    orientation: Orientation = "upright",
 ) -> tuple[FeatureFile, Colors]:
     """Extract the features of images to a file.
 
@@ -85,7 +111,7 @@ def extract_features(
     colors = {}
     with FeatureWriter(output) as writer:
         for name in progress(names, "extract features"):
-            image = read_image(images / name)
+            image = read_image(images / name, orientation)
             features = extractor.extract(image, mask_of(masks, name, image.shape[:2]))
             colors[name] = image_colors(image, features.keypoints)
             writer.write(name, features)
@@ -119,7 +145,7 @@ def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
 
 
 def redescribe(
-    posed_images: list[pycolmap.Image], folder: Path, progress: ProgressBar
+    posed_images: list[pycolmap.Image], folder: Path, progress: ProgressBar, orientation: Orientation
 ) -> tuple[dict[str, Features], Sift]:
     """Describe the keypoints of a model's images by SIFT.
 
@@ -134,7 +160,7 @@ def redescribe(
     features = {}
     observations = described = 0
     for image in progress(posed_images, "describe keypoints"):
-        features[image.name] = one = _redescribe_image(image, folder / image.name, extractor)
+        features[image.name] = one = _redescribe_image(image, folder / image.name, extractor, orientation)
         seen = np.array(image.get_observation_point2D_idxs(), np.int64)
         observations += len(seen)
         described += int(one.descriptors[seen].any(axis=1).sum())
@@ -146,14 +172,23 @@ def redescribe(
     return features, extractor
 
 
-def _redescribe_image(image: pycolmap.Image, path: Path, extractor: Sift) -> Features:
-    pixels = read_image(path)
+def _redescribe_image(
+    image: pycolmap.Image, path: Path, extractor: Sift, orientation: Orientation
+) -> Features:
+    pixels = read_image(path, orientation)
     height, width = pixels.shape[:2]
     camera = camera_of(image)
     if (width, height) != (camera.width, camera.height):
+        turned = read_orientation(path) != 1 and (height, width) == (camera.width, camera.height)
+        other = "upright" if orientation == "stored" else "stored"
+        advice = (
+            f"the model seems to be of its {other} pixels, so use `orientation={other!r}`"
+            if turned
+            else "give the images that the model was made from"
+        )
         raise ImageError(
-            f"{path}: {width}x{height} pixels, but its camera in the model has "
-            f"{camera.width}x{camera.height}; give the images that the model was made from"
+            f"{path}: {width}x{height} {orientation} pixels, but its camera in the model has "
+            f"{camera.width}x{camera.height}; {advice}"
         )
     keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
     gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)

@@ -10,6 +10,7 @@ from jaxtyping import Float32, Int64
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
+from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.store import FeatureFile, MatchFile
 from slimsfm.mapping.descriptors import with_global_descriptors
@@ -17,6 +18,7 @@ from slimsfm.mapping.extraction import redescribe
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, estimate_box, read_box, read_model
 from slimsfm.mapping.sfm import colmap_warnings, verified_matches
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
 _MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
@@ -41,6 +43,10 @@ class ImportOptions:
 
     extractor: str = "sift"
     """Extractor of `features`, which is also used for queries."""
+
+    orientation: Orientation = "stored"
+    """Which pixels of the image files the model is of: as they are stored, as in COLMAP and hloc, or turned
+    upright according to EXIF. Queries are read alike."""
 
     box: Path | None = None
     """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
@@ -102,9 +108,18 @@ def import_colmap(
         box=given_box or estimate_box(model),
         box_source="given" if given_box else "estimated",
         origin=f"imported COLMAP model with descriptors from {source.origin}",
+        orientation=options.orientation,
+        exif_orientations=_tags(model, options),
     )
     made = Map(model=model, features=source.features, matches=source.matches, info=info)
     return with_global_descriptors(made)
+
+
+def _tags(model: pycolmap.Reconstruction, options: ImportOptions) -> dict[str, int]:
+    if options.orientation == "stored" or options.images is None:
+        return {}
+    tags = {image.name: read_orientation(options.images / image.name) for image in _posed_images(model)}
+    return {name: tag for name, tag in tags.items() if tag != 1}
 
 
 def _find_source(
@@ -113,7 +128,7 @@ def _find_source(
     if options.features:
         return _from_hloc(model, options)
     if options.images:
-        return _from_images(model, options.images, progress)
+        return _from_images(model, options.images, options.orientation, progress)
     database = options.database or _database_next_to(model_path)
     return _from_database(model, database)
 
@@ -250,10 +265,12 @@ def _consistent_matches(
     return verified
 
 
-def _from_images(model: pycolmap.Reconstruction, images: Path, progress: ProgressBar) -> _Source:
+def _from_images(
+    model: pycolmap.Reconstruction, images: Path, orientation: Orientation, progress: ProgressBar
+) -> _Source:
     if not images.is_dir():
         raise InputError(f"{images}: no such folder of images")
-    features, extractor = redescribe(_posed_images(model), images, progress)
+    features, extractor = redescribe(_posed_images(model), images, progress, orientation)
     return _Source(
         features=features,
         matches={},

@@ -16,6 +16,7 @@ from slimsfm.errors import MapError
 from slimsfm.features import Features, NearestOptions
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
+from slimsfm.photos import Orientation
 
 MapKind = Literal["full", "images", "points", "images and points"]
 
@@ -44,6 +45,13 @@ class MapInfo:
 
     notes: tuple[str, ...] = ()
     """Sentences, with names, on what was skipped, ignored or guessed when the map was made."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the image files model, features and poses are of. Queries are read alike."""
+
+    exif_orientations: Mapping[str, int] = field(default_factory=dict)
+    """EXIF orientation of the images of an upright map, by name, where it is not 1. Empty in maps of version
+    0.1, which did not record it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
