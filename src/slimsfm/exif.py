@@ -89,6 +89,7 @@ def read_exif(path: str | Path) -> Exif:
 _FOCAL_LENGTHS = {
     "FocalLengthIn35mmFilm": ExifTags.Base.FocalLengthIn35mmFilm,
     "FocalLength": ExifTags.Base.FocalLength,
+    "FocalPlaneXResolution": ExifTags.Base.FocalPlaneXResolution,
 }
 
 

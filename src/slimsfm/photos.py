@@ -1,7 +1,6 @@
 """Image files: list them, and read their pixels, upright or as they are stored."""
 
 import struct
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,10 +93,8 @@ def exif_orientation(file: PillowImage.Image) -> int:
 def exif_of(file: PillowImage.Image) -> dict[int, Any]:
     """The EXIF data of an open image file by tag, with those of the lens; empty if they are damaged."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow warns of damaged EXIF data
-            exif = file.getexif()
-            return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+        exif = file.getexif()
+        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
     except (SyntaxError, ValueError, KeyError, TypeError, struct.error):
         return {}
 

@@ -72,7 +72,7 @@ def guess_cameras(
         widths = Counter(by_name[name].width for name in names)
         usual = max(widths, key=lambda width: (widths[width], width))
         turned |= {name: first[usual] for name in names if by_name[name].width != usual}
-    return GuessedCameras(by_name=by_name, turned=turned)
+    return GuessedCameras(by_name={name: by_name[name] for name in exifs}, turned=turned)
 
 
 def _key(name: str, exif: Exif, camera: pycolmap.Camera, sharing: CameraSharing) -> tuple:
