@@ -17,12 +17,13 @@ import numpy as np
 import pycolmap
 
 from slimsfm.geometry import corner_error
+from slimsfm.image_files import list_images
 from slimsfm.localization import Localizer
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.importing import import_colmap
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
-from slimsfm.photos import list_images, read_image
+from slimsfm.photos import read_image
 from slimsfm.progress import shown
 from slimsfm.reduction import ImageOptions, ReduceOptions, reduce
 

@@ -6,7 +6,8 @@ from PIL import Image
 from exif_photos import STORED, save_photo
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import camera_from_exif, read_exif
-from slimsfm.photos import list_images, read_image, read_mask, shrink
+from slimsfm.image_files import list_images
+from slimsfm.photos import read_image, read_mask, shrink
 
 UPRIGHT = np.zeros((4, 6, 3), np.uint8)
 UPRIGHT[0, 0], UPRIGHT[0, -1], UPRIGHT[-1, 0], UPRIGHT[-1, -1] = (

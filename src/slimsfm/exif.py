@@ -13,7 +13,8 @@ import pycolmap
 from PIL import ExifTags
 from PIL import Image as PillowImage
 
-from slimsfm.photos import Orientation, exif_of, exif_orientation, reading
+from slimsfm.image_files import named
+from slimsfm.photos import Orientation, exif_of, exif_orientation, opened
 
 _SMALLEST_FIELD_DEG, _LARGEST_FIELD_DEG = 5.0, 150.0  # of view, along the longer side
 _GUESS = 1.2  # focal length over the longer side, as in COLMAP
@@ -67,7 +68,7 @@ def read_exif(path: str | Path) -> Exif:
     Raises:
         ImageError: The file is missing or not an image.
     """
-    with reading(path), PillowImage.open(path) as file:
+    with opened(path) as file:
         exif, size, tag = exif_of(file), stored_size(file), exif_orientation(file)
     found = {name: exif[key] for name, key in _FOCAL_LENGTHS.items() if key in exif}
     focal = _inferred_focal(path)
@@ -137,7 +138,7 @@ def read_orientation(path: str | Path) -> int:
     Raises:
         ImageError: The file is missing or not an image.
     """
-    with reading(path), PillowImage.open(path) as file:
+    with opened(path) as file:
         return exif_orientation(file)
 
 
@@ -159,12 +160,6 @@ def ignored_values(exifs: Mapping[str, Exif]) -> tuple[str, ...]:
         if exif.ignored:
             names.setdefault(exif.ignored, []).append(name)
     return tuple(
-        f"ignored the EXIF focal length of {len(some)} photo{'s' * (len(some) != 1)} ({ignored}), which is "
-        f"impossible: {listed(some)}"
+        named(f"photo(s) whose EXIF focal length is impossible and ignored ({ignored})", some)
         for ignored, some in names.items()
     )
-
-
-def listed(names: list[str]) -> str:
-    """Names for a message: all of up to ten, else the first eight and the number of the others."""
-    return ", ".join(names) if len(names) <= 10 else f"{', '.join(names[:8])} and {len(names) - 8} more"

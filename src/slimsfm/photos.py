@@ -1,87 +1,144 @@
-"""Image files: list them, and read their pixels, upright or as they are stored."""
+"""Image files: read their pixels, upright or as they are stored.
 
+Pixels of more than eight bits are scaled to eight by the bits that the image uses: 8, 10, 12, 14, 16 ... hold
+its largest value. So 12-bit values in a file of 16 bits are as bright as in one of 12. Floating-point values
+are from 0 (black) to 1 (white) unless one is larger, and then count as integers; values below 0 and those
+that are no number are black.
+"""
+
+import re
 import struct
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
-from PIL import ExifTags, UnidentifiedImageError
+from jaxtyping import Shaped, UInt8
+from PIL import ExifTags, ImageCms, UnidentifiedImageError
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import GrayImage, Image
-from slimsfm.errors import ImageError, InputError
+from slimsfm.errors import ImageError
+from slimsfm.image_files import INSTALL_HEIC, can_read_heic
 
 Orientation = Literal["upright", "stored"]
 """Which pixels of an image file: turned upright according to its EXIF orientation, or as they are stored, as
 COLMAP and hloc read them."""
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
-
-_UNREADABLE = (
-    UnidentifiedImageError,
-    PillowImage.DecompressionBombError,
-    OSError,
-    ValueError,
-    SyntaxError,
-    RuntimeError,
-)
-
-_TURN = PillowImage.Transpose
-_UPRIGHT = {
-    2: _TURN.FLIP_LEFT_RIGHT,
-    3: _TURN.ROTATE_180,
-    4: _TURN.FLIP_TOP_BOTTOM,
-    5: _TURN.TRANSPOSE,
-    6: _TURN.ROTATE_270,
-    7: _TURN.TRANSVERSE,
-    8: _TURN.ROTATE_90,
-}  # from the stored pixels, by EXIF orientation
-_STORED = _UPRIGHT | {6: _TURN.ROTATE_90, 8: _TURN.ROTATE_270}  # from the upright pixels
+_UNREADABLE = (UnidentifiedImageError, OSError, EOFError, ValueError, SyntaxError, RuntimeError)
+_HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+_WIDE = "I", "F"  # first letters of Pillow's modes of more than eight bits
 
 
-def list_images(folder: str | Path) -> list[str]:
-    """List the images in a folder and its subfolders.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photo:
+    """An image, upright or as it is stored, and what its file says besides."""
 
-    Returns:
-        Paths relative to the folder, with forward slashes, sorted; without hidden files and folders.
+    image: Image
+    """RGB."""
 
-    Raises:
-        InputError: The folder does not exist or contains no image.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of images")
-    paths = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
-    names = sorted(path.relative_to(folder).as_posix() for path in paths)
-    names = [name for name in names if not any(part.startswith(".") for part in name.split("/"))]
-    if not names:
-        raise InputError(f"{folder}: contains no image ({', '.join(sorted(SUFFIXES))})")
-    return names
+    alpha: GrayImage | None
+    """0 where the image is fully transparent; None if it is opaque everywhere."""
+
+    orientation: int
+    """EXIF orientation of the file, from 1 to 8; 1 if it has none."""
+
+    num_frames: int
+    """Number of frames or pages in the file, of which this is the first."""
 
 
-def read_image(path: str | Path, orientation: Orientation = "upright") -> Image:
-    """Read an image as RGB.
+def read_photo(path: str | Path, orientation: Orientation = "upright") -> Photo:
+    """Read an image of any format, color mode and bit depth.
 
     Args:
         path: The file.
-        orientation: Whether to turn the pixels upright according to the EXIF orientation of the file.
+        orientation: Whether to turn the pixels upright by the EXIF orientation of the file.
 
     Raises:
-        ImageError: The file is missing or not a complete image.
+        ImageError: The file is missing, not a complete image, or too large.
     """
-    with reading(path), PillowImage.open(path) as file:
-        tag = exif_orientation(file)
-        file.load()
-        is_upright = exif_orientation(file) != tag  # Pillow turns TIFF files itself
-        turns = {} if is_upright == (orientation == "upright") else _STORED if is_upright else _UPRIGHT
-        picture = file.transpose(turns[tag]) if tag in turns else file
-        if picture.mode.startswith("I;16"):  # Pillow would clip 16 bits to 8 instead of scaling them
-            picture = PillowImage.fromarray((np.asarray(picture) >> 8).astype(np.uint8))
-        return np.array(picture.convert("RGB"))
+    stored = _read(path)
+    image, alpha = _as_rgb(stored.values), stored.alpha
+    if orientation == "upright":
+        image = upright(image, stored.orientation)
+        alpha = None if alpha is None else upright(alpha, stored.orientation)
+    return Photo(image=image, alpha=alpha, orientation=stored.orientation, num_frames=stored.num_frames)
+
+
+def read_image(path: str | Path, orientation: Orientation = "upright") -> Image:
+    """Read an image as RGB; transparency is ignored, and of several frames the first is read.
+
+    Args:
+        path: The file.
+        orientation: Whether to turn the pixels upright by the EXIF orientation of the file.
+
+    Raises:
+        ImageError: As in `read_photo`.
+    """
+    return read_photo(path, orientation).image
+
+
+class StoredMask(NamedTuple):
+    """A mask as its file holds it."""
+
+    mask: GrayImage
+    """255 where features are kept, 0 elsewhere."""
+
+    orientation: int
+    """EXIF orientation of the file, 1 if it has none."""
+
+
+def read_stored_mask(path: str | Path) -> StoredMask:
+    """Read a mask of any color mode and bit depth as stored: what is not black or transparent is kept.
+
+    Raises:
+        ImageError: As in `read_photo`.
+    """
+    stored = _read(path)
+    kept = stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2)
+    if stored.alpha is not None:
+        kept &= stored.alpha > 0
+    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.orientation)
+
+
+def read_mask(path: str | Path) -> GrayImage:
+    """Read a mask like `read_stored_mask`, turned upright by its EXIF orientation.
+
+    Raises:
+        ImageError: As in `read_photo`.
+    """
+    return upright(*read_stored_mask(path))
+
+
+def upright(
+    stored: Shaped[np.ndarray, "_ _ *channels"], orientation: int
+) -> Shaped[np.ndarray, "_ _ *channels"]:
+    """Turn stored pixels upright that have this EXIF orientation."""
+    if orientation >= 5:
+        stored = stored.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        stored = stored[::-1]
+    if orientation in (2, 3, 6, 7):
+        stored = stored[:, ::-1]
+    return np.ascontiguousarray(stored)
+
+
+def as_stored(
+    upright: Shaped[np.ndarray, "_ _ *channels"], orientation: int
+) -> Shaped[np.ndarray, "_ _ *channels"]:
+    """Turn upright pixels as a file of this EXIF orientation stores them."""
+    if orientation in (2, 3, 6, 7):
+        upright = upright[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        upright = upright[::-1]
+    if orientation >= 5:
+        upright = upright.swapaxes(0, 1)
+    return np.ascontiguousarray(upright)
 
 
 def exif_orientation(file: PillowImage.Image) -> int:
@@ -99,24 +156,129 @@ def exif_of(file: PillowImage.Image) -> dict[int, Any]:
         return {}
 
 
+class _Stored(NamedTuple):
+    values: Shaped[np.ndarray, "_ _ *channels"]  # gray or RGB of any depth
+    alpha: GrayImage | None
+    orientation: int
+    num_frames: int
+
+
+def _read(path: str | Path) -> _Stored:
+    with opened(path) as file:
+        orientation = exif_orientation(file)
+        values, alpha = (
+            _deep_values(file, path),
+            None,
+        )  # first, because Pillow forgets the depth when it decodes
+        # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
+        num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
+        if values is None:
+            values, alpha = _values(file)
+            if exif_orientation(file) != orientation:  # Pillow turns TIFF files when it decodes them
+                values = as_stored(values, orientation)
+                alpha = None if alpha is None else as_stored(alpha, orientation)
+        elif values.ndim == 3 and values.shape[2] == 4:
+            values, alpha = values[..., :3], np.where(values[..., 3], 255, 0).astype(np.uint8)
+        if alpha is not None and alpha.all():
+            alpha = None
+        return _Stored(values, alpha, orientation, num_frames)
+
+
+def _values(file: PillowImage.Image) -> tuple[Shaped[np.ndarray, "_ _ *channels"], GrayImage | None]:
+    """Gray or RGB values and alpha as Pillow decodes them."""
+    if file.mode.startswith(_WIDE):
+        return np.array(file), None
+    if file.mode == "LAB":
+        lab, rgb = (ImageCms.createProfile(space) for space in ("LAB", "sRGB"))
+        file = ImageCms.profileToProfile(file, lab, rgb, outputMode="RGB") or file
+    if file.has_transparency_data:
+        pixels = np.array(file.convert("RGBA"))
+        return pixels[..., :3], pixels[..., 3]
+    return np.array(file.convert("RGB")), None
+
+
+def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray, "_ _ _"] | None:
+    """RGB or RGBA of 16 bits per channel, of which Pillow keeps the upper eight; None for other images."""
+    if file.mode.startswith(_WIDE) or not _is_deep(file):
+        return None
+    file.load()  # OpenCV takes half a file for a whole one, Pillow does not
+    found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.dtype != np.uint16 or found.ndim != 3:
+        return None
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+
+
+def _is_deep(file: PillowImage.Image) -> bool:
+    arguments = [tile[3] for tile in getattr(file, "tile", [])]
+    parts = [part for one in arguments for part in (one if isinstance(one, tuple) else (one,))]
+    if file.format == "PPM":
+        return any(isinstance(part, int) and part > 255 for part in parts)
+    return any(isinstance(part, str) and ";16" in part for part in parts)
+
+
+def _as_rgb(values: Shaped[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w 3"]:
+    if values.dtype != np.uint8:
+        values = _as_bytes(values)
+    return np.repeat(values[..., None], 3, axis=2) if values.ndim == 2 else values
+
+
+def _as_bytes(values: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Scale values of more than eight bits to eight, by the rule at the top of this module."""
+    is_float = np.issubdtype(values.dtype, np.floating)
+    values = np.maximum(np.where(np.isfinite(values), values, 0) if is_float else values, 0)
+    most = values.max(initial=0)
+    if is_float and most <= 1:
+        return np.round(255 * values).astype(np.uint8)
+    bits = max(8, int(most).bit_length())
+    return (values // 2 ** (bits + bits % 2 - 8)).astype(np.uint8)
+
+
 @contextmanager
-def reading(path: str | Path) -> Iterator[None]:
-    """Report a file that Pillow cannot read as an `ImageError`."""
+def opened(path: str | Path) -> Iterator[PillowImage.Image]:
+    """Open an image file.
+
+    Raises:
+        ImageError: As in `read_photo`, here or within the context.
+    """
+    with _reading(path):
+        with Path(path).open("rb") as raw:
+            head = raw.read(12)
+        if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
+            raise ImageError(f"{path}: {INSTALL_HEIC}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PillowImage.DecompressionBombWarning)
+            file = PillowImage.open(path)
+        with file:
+            yield file
+
+
+@cache
+def _register_heic() -> bool:
+    """Teach Pillow to read HEIC; returns whether that is possible."""
+    if not can_read_heic():
+        return False
+    import pillow_heif  # an extra
+
+    pillow_heif.register_heif_opener()
+    return True
+
+
+@contextmanager
+def _reading(path: str | Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
         raise ImageError(f"{path}: no such image") from error
+    except PillowImage.DecompressionBombError as error:
+        has, most = (int(number) / 1e6 for number in re.findall(r"\d+", str(error))[:2])
+        raise ImageError(
+            f"{path}: has {has:.0f} megapixels, too large: up to {most:.0f} are read; shrink the image"
+        ) from error
     except _UNREADABLE as error:
-        raise ImageError(f"{path}: not a readable image; remove or replace it") from error
-
-
-def read_mask(path: str | Path) -> GrayImage:
-    """Read a mask of any color mode: features are kept where it is not black.
-
-    Raises:
-        ImageError: The file is missing or not a complete image.
-    """
-    return read_image(path).max(axis=2)
+        raise ImageError(
+            f"{path}: not a readable image: damaged, or of a kind that is not supported; convert, replace or "
+            "remove it"
+        ) from error
 
 
 def shrink(image: UInt8[np.ndarray, "_ _ *channels"], max_size: int) -> UInt8[np.ndarray, "_ _ *channels"]:

@@ -1,6 +1,7 @@
 """A map says which pixels of its photos it is of, and COLMAP gets a model of the stored ones."""
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import cycle
@@ -205,7 +206,7 @@ def test_the_commands_say_which_pixels_a_map_is_of(upright, tmp_path):
     assert "upright (7 of 8 images turned by EXIF)" in slimsfm("info", tmp_path / "map").out
     exported = slimsfm("export", "colmap", tmp_path / "map", "-o", tmp_path / "model")
     assert exported.code == 0
-    assert "left out 4 images whose EXIF orientation mirrors them: 4.png, 5.png, 6.png, 7.png" in exported.out
+    assert re.search(r"4 images left out.*mirrors them: 4\.png, 5\.png, 6\.png, 7\.png", exported.out)
     model = pycolmap.Reconstruction(tmp_path / "model")
     assert sorted(image.name for image in model.images.values()) == ["0.png", "1.png", "2.png", "3.png"]
     assert (

@@ -14,7 +14,7 @@ def build_photos(
     images: ImagesPath,
     /,
     output: OutputPath,
-    build: Annotated[BuildOptions, Advanced(("masks", "max_image_size", "max_features", "seed"))] = (
+    build: Annotated[BuildOptions, Advanced(("masks", "alpha", "max_image_size", "max_features", "seed"))] = (
         BuildOptions()
     ),
     networks: Annotated[Networks, Advanced()] = Networks(),

@@ -7,9 +7,9 @@ from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural, size
 from slimsfm.errors import OutputError
-from slimsfm.exif import listed
 from slimsfm.features.registry import export_method
 from slimsfm.files import check_writable, replacing
+from slimsfm.image_files import named
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
@@ -70,12 +70,8 @@ def export_colmap(map: MapPath, /, output: OutputPath, overwrite: bool = False) 
 
 def _print_left_out(exported: Map) -> None:
     if mirrored := mirrored_images(exported):
-        number = plural(len(mirrored), "image")
-        console.print(
-            f"left out {number} whose EXIF orientation mirrors them: {listed(mirrored)}",
-            style="yellow",
-            markup=False,
-        )
+        text = named("image(s) left out, because their EXIF orientation mirrors them", mirrored)
+        console.print(text, style="yellow", markup=False)
 
 
 def export_hloc(

@@ -17,11 +17,11 @@ from pathlib import Path
 from slimsfm.datasets.base import TWO_VIEWS, LoadOptions, ObjectSequences, PosedSequence
 from slimsfm.datasets.reading import check_object_name, image_size, read_text
 from slimsfm.errors import ImageError, InputError
+from slimsfm.image_files import find_images, is_image, list_images
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
-from slimsfm.photos import SUFFIXES, list_images
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class Images:
         """Sorted names of the objects: the names of their folders."""
         if self._holds_photos():
             return (self.path.resolve().name,)
-        photos = list_images(self.path)
+        photos = find_images(self.path).names
         return tuple(sorted({name.split("/")[0] for name in photos}))
 
     def load(self, name: str, options: LoadOptions) -> ObjectSequences:
@@ -51,14 +51,12 @@ class Images:
         """
         check_object_name(name, self.names(), self.path)
         folder = self.path if self._holds_photos() else self.path / name
-        query_names(list_images(folder), self.query_every)  # checked before the long work
+        query_names(list(find_images(folder).names), self.query_every)  # checked before the long work
         truth = _pseudo_ground_truth(folder, options)
         return _split(truth, name, folder, query_names(list(truth.images), self.query_every))
 
     def _holds_photos(self) -> bool:
-        return self.path.is_dir() and any(
-            path.suffix.lower() in SUFFIXES and not path.name.startswith(".") for path in self.path.iterdir()
-        )
+        return self.path.is_dir() and any(is_image(path) for path in self.path.iterdir())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,9 +12,10 @@ import pycolmap
 from slimsfm.arrays import Image
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.features import Features
+from slimsfm.image_files import list_images
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.photos import Orientation, list_images, read_image
+from slimsfm.photos import Orientation, read_image
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
 

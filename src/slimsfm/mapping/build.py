@@ -5,20 +5,22 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, get_args, runtime_checkable
 
 import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Image
-from slimsfm.errors import InputError
+from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.exif import Exif, ignored_values, read_exif, read_orientation
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
 from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
+from slimsfm.image_files import find_images
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
 from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.orientation import turned_model, turned_pixels
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
@@ -31,7 +33,7 @@ from slimsfm.mapping.sfm import (
     verified_matches,
     write_database,
 )
-from slimsfm.photos import Orientation, list_images
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -53,7 +55,11 @@ class BuildOptions:
     detector, exhaustive up to 30 images, otherwise by pose if poses are known, else sequential."""
 
     masks: Path | None = None
-    """Folder of masks, NAME.png for image NAME as in COLMAP; features on black pixels are ignored."""
+    """Folder of masks, IMG.jpg.png or IMG.png for image IMG.jpg as in COLMAP; where a mask is black, no
+    features are used."""
+
+    alpha: AlphaUse = "mask"
+    """What transparency does: transparent pixels hold no features (mask), or are like any others (ignore)."""
 
     extractor: str = "sift"
     """Local features, see `slimsfm methods`; loftr matches images without a detector."""
@@ -77,6 +83,8 @@ class BuildOptions:
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
+        if self.alpha not in get_args(AlphaUse):
+            raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaUse))}, got {self.alpha!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +114,9 @@ def build_map(
 ) -> Map:
     """Build a map from a folder of photos by Structure from Motion.
 
-    Photos that could not be registered are named in `Map.unregistered`. The map reads its features from disk
-    when they are needed, so that large maps fit into memory.
+    Photos that could not be registered are named in `Map.unregistered`, and what was skipped or ignored in
+    `MapInfo.notes`. The map reads its features from disk when they are needed, so that large maps fit into
+    memory.
 
     Args:
         images: Folder. All images in it and its subfolders are used or, with known poses, those with a pose.
@@ -122,16 +131,19 @@ def build_map(
         ReconstructionError: The images give no model.
     """
     images = Path(images)
-    names = sorted(known.cam_from_world) if known else list_images(images)
+    names, notes = _photos_of(images, options.masks, known)
     if len(names) < 2:
         raise InputError(f"{images}: holds {len(names)} image; a map needs at least two")
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
+    photos = MaskedPhotos(images, names, options.masks, options.alpha, options.orientation)
     exifs = {} if known else {name: read_exif(images / name) for name in names}
     guessed = guess_cameras(exifs, options.camera, options.orientation)
+    notes = (*notes, *ignored_values(exifs))
     with _opened(workspace) as folder, colmap_warnings():
         work = BuildWork(
             images=images,
+            photos=photos,
             names=names,
             workspace=folder,
             cameras=known.cameras if known else guessed.by_name,
@@ -139,11 +151,14 @@ def build_map(
             known=known,
             progress=progress,
         )
-        if isinstance(extractor, ModelBuilder):
-            _check_not_turned(work, options)
-            parts = extractor.build_model(work, options)
-        else:
-            parts = _parts_with_keypoints(work, extractor, options)
+        try:
+            if isinstance(extractor, ModelBuilder):
+                _check_not_turned(work, options)
+                parts = extractor.build_model(work, options)
+            else:
+                parts = _parts_with_keypoints(work, extractor, options)
+        except ReconstructionError as error:  # what was skipped may be the reason
+            raise ReconstructionError("; ".join([str(error), *notes, *photos.notes])) from error
     info = MapInfo(
         extractor=parts.extractor.name,
         extractor_options=parts.extractor.options,
@@ -151,11 +166,9 @@ def build_map(
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
-        notes=ignored_values(exifs),
+        notes=(*notes, *photos.notes),
         orientation=options.orientation,
-        exif_orientations=_exif_orientations(images, names, exifs)
-        if options.orientation == "upright"
-        else {},
+        exif_orientations=_exif_orientations(work, exifs) if options.orientation == "upright" else {},
     )
     registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     made = Map(
@@ -169,9 +182,23 @@ def build_map(
     return with_global_descriptors(made)
 
 
-def _exif_orientations(images: Path, names: list[str], exifs: Mapping[str, Exif]) -> dict[str, int]:
-    tags = {name: exifs[name].orientation if exifs else read_orientation(images / name) for name in names}
+def _exif_orientations(work: "BuildWork", exifs: Mapping[str, Exif]) -> dict[str, int]:
+    tags = {
+        name: exifs[name].orientation if exifs else read_orientation(work.images / name)
+        for name in work.names
+    }
     return {name: tag for name, tag in tags.items() if tag != 1}
+
+
+def _photos_of(
+    images: Path, masks: Path | None, known: KnownPoses | None
+) -> tuple[list[str], tuple[str, ...]]:
+    """Names of the photos to use, and notes on what is skipped; masks in a subfolder are no photos."""
+    if known:
+        return sorted(known.cam_from_world), ()
+    inside = masks is not None and Path(masks).resolve() != images.resolve()
+    found = find_images(images, leave_out=masks if inside else None)
+    return list(found.names), found.notes
 
 
 @contextmanager
@@ -191,6 +218,9 @@ class BuildWork:
 
     images: Path
     """Folder of the photos."""
+
+    photos: MaskedPhotos
+    """The photos with their masks."""
 
     names: list[str]
     """Names of the photos to use, relative to the folder."""
@@ -247,9 +277,7 @@ class ModelBuilder(Protocol):
 
 def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
-    features, colors = extract_features(
-        work.images, names, extractor, options.masks, output, work.progress, options.orientation
-    )
+    features, colors = extract_features(work.photos, names, extractor, output, work.progress)
     database, sfm = _match(work, features, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
     if work.known:

@@ -22,8 +22,9 @@ from slimsfm.exif import Exif, read_orientation
 from slimsfm.features import Extractor, Features, image_colors
 from slimsfm.features.sift import Sift, root_sift
 from slimsfm.features.store import FeatureFile, FeatureWriter
+from slimsfm.mapping.masked_photos import MaskedPhotos
 from slimsfm.mapping.model import camera_of
-from slimsfm.photos import Orientation, read_image, read_mask
+from slimsfm.photos import Orientation, read_image
 from slimsfm.progress import ProgressBar
 
 CameraSharing = Literal["auto", "shared", "per-image"]
@@ -95,45 +96,23 @@ def _check_equal_sizes(guesses: Mapping[str, pycolmap.Camera]) -> None:
 
 
 def extract_features(
-    images: Path,
-    names: list[str],
-    extractor: Extractor,
-    masks: Path | None,
-    output: Path,
-    progress: ProgressBar,
-    orientation: Orientation = "upright",
+    photos: MaskedPhotos, names: list[str], extractor: Extractor, output: Path, progress: ProgressBar
 ) -> tuple[FeatureFile, Colors]:
     """Extract the features of images to a file.
 
     Raises:
-        InputError: An image cannot be read, or its mask is unreadable or of another size.
+        InputError: An image cannot be read, its mask is unreadable or of another size, or masks leave fewer
+            than two images with pixels.
     """
     colors = {}
     with FeatureWriter(output) as writer:
         for name in progress(names, "extract features"):
-            image = read_image(images / name, orientation)
-            features = extractor.extract(image, mask_of(masks, name, image.shape[:2]))
-            colors[name] = image_colors(image, features.keypoints)
+            photo = photos.read(name)
+            features = extractor.extract(photo.image, photo.mask)
+            colors[name] = image_colors(photo.image, features.keypoints)
             writer.write(name, features)
+    photos.check()
     return FeatureFile(output), colors
-
-
-def mask_of(masks: Path | None, name: str, shape: tuple[int, ...]) -> GrayImage | None:
-    """The mask of an image, NAME.png as in COLMAP; None for an image without a mask, which is used whole.
-
-    Raises:
-        InputError: The folder does not exist, or the mask is unreadable or of another size.
-    """
-    masks = Path(masks) if masks else None
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"{masks}: no such folder of masks")
-    path = masks / f"{name}.png" if masks else None
-    if path is None or not path.exists():
-        return None
-    mask = read_mask(path)
-    if mask.shape != shape:
-        raise ImageError(f"{path}: the mask is {mask.shape[::-1]} pixels, its upright image {shape[::-1]}")
-    return mask
 
 
 def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:

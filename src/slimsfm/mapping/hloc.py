@@ -24,9 +24,9 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.features import Features, unit_rows
 from slimsfm.features.store import FeatureWriter, write_matches
 from slimsfm.files import replacing
+from slimsfm.image_files import list_images
 from slimsfm.mapping.map import Map, check_num_features
 from slimsfm.mapping.orientation import stored_model, turned_features, turns_to_stored
-from slimsfm.photos import list_images
 
 
 def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overwrite: bool = False) -> None:

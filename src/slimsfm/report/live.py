@@ -18,10 +18,11 @@ import viser
 from slimsfm.arrays import Image
 from slimsfm.errors import ImageError, InputError
 from slimsfm.geometry import corner_error
+from slimsfm.image_files import list_images
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.cameras import FocalLength, query_camera
 from slimsfm.mapping.map import Map
-from slimsfm.photos import Orientation, list_images, read_image, shrink
+from slimsfm.photos import Orientation, read_image, shrink
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.report.live_panel import AFTER, BEFORE, MAX_PHOTO_PX, ViewerPanel
 from slimsfm.report.scene3d import Scene3D, build_scene3d

@@ -16,7 +16,8 @@ import numpy as np
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, OutputError
 from slimsfm.files import replacing
-from slimsfm.photos import Orientation, list_images, read_image
+from slimsfm.image_files import list_images
+from slimsfm.photos import Orientation, read_image
 
 VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """Container formats of the videos that can be written, by suffix."""

@@ -189,7 +189,7 @@ class DetectorFree:
             work.cameras,
             work.workspace,
             cam_from_world=poses,
-            masks=options.masks,
+            masks=_masks(work),
             seed=options.seed,
             progress=work.progress,
         )
@@ -204,6 +204,13 @@ class DetectorFree:
     def reference_matching(self, map: Map) -> ReferenceMatching:
         """Match queries with a map's photos; see `slimsfm.localization.matching.WholeImageExtractor`."""
         return DetectorFreeMatching(map, lambda: self.matcher)
+
+
+def _masks(work: BuildWork) -> dict[str, GrayImage]:
+    read = ((name, work.photos.read(name).mask) for name in work.names)
+    masks = {name: mask for name, mask in read if mask is not None}
+    work.photos.check()
+    return masks
 
 
 class PhotoFolder(Mapping[str, Photo]):

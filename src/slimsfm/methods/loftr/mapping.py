@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
-from slimsfm.mapping.extraction import color_points, mask_of
+from slimsfm.mapping.extraction import color_points
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
 from slimsfm.mapping.sfm import reconstruct, triangulate, verified_matches, write_database
 from slimsfm.methods.loftr.cells import (
@@ -27,6 +27,7 @@ from slimsfm.methods.loftr.cells import (
     EncodedImage,
     ImageMatcher,
     Photo,
+    PhotoMask,
     in_tiles,
     match_without_keypoints,
 )
@@ -223,7 +224,7 @@ def build_without_keypoints(
     workspace: Path,
     *,
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None = None,
-    masks: Path | None = None,
+    masks: Mapping[str, PhotoMask] | None = None,
     seed: int = 0,
     progress: ProgressBar = silent,
 ) -> KeypointFreeModel:
@@ -236,17 +237,15 @@ def build_without_keypoints(
         cameras: Intrinsics by image name; images with equal `camera_id` share a camera.
         workspace: Folder for intermediate files.
         cam_from_world: Known poses by image name; then poses and cameras are not refined.
-        masks: Folder of masks; cells where a mask is black are not matched.
+        masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
         seed: Seed of all random choices.
         progress: Progress callback.
 
     Raises:
-        InputError: A photo or a mask cannot be used.
+        InputError: A photo cannot be used.
         ReconstructionError: No model can be reconstructed from the photos.
     """
-    read = {name: mask_of(masks, name, photos[name].shape[:2]) for name in photos} if masks else {}
-    masked = {name: mask for name, mask in read.items() if mask is not None}
-    cells = match_without_keypoints(photos, pairs, matcher, masked, progress)
+    cells = match_without_keypoints(photos, pairs, matcher, masks, progress)
     rough, matches = _reconstruct(cells, cameras, cam_from_world, workspace, seed, progress)
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
     if cam_from_world is None:

@@ -1,0 +1,159 @@
+"""The photos of a folder with their masks: which pixels may hold features.
+
+A mask is a PNG file whose name is that of the photo plus `.png`, or, if there is none, that of the photo with
+its suffix replaced by `.png`. Both are COLMAP's rules. What is not black in it is kept, whatever its bit
+depth. A mask is as upright as its photo is read: an orientation tag of its own turns it; without one, a mask
+that only fits the photo turned the other way is turned with it. Transparent pixels of a photo hold no
+features either, unless they are told to.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal, get_args
+
+from slimsfm.arrays import GrayImage, Image
+from slimsfm.errors import ImageError, InputError
+from slimsfm.image_files import find_images, named
+from slimsfm.photos import Orientation, Photo, as_stored, read_photo, read_stored_mask, upright
+
+AlphaUse = Literal["mask", "ignore"]
+"""What transparency does: fully transparent pixels hold no features, or are like any others."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MaskedPhoto:
+    """A photo and which of its pixels may hold features."""
+
+    image: Image
+    """RGB."""
+
+    mask: GrayImage | None
+    """0 where there are no features; None if they may be anywhere."""
+
+
+class MaskedPhotos:
+    """Reads the photos of a folder with their masks, and remembers what is to be said about them."""
+
+    def __init__(
+        self,
+        folder: Path,
+        names: list[str],
+        masks: Path | None = None,
+        alpha: AlphaUse = "mask",
+        orientation: Orientation = "upright",
+    ) -> None:
+        """Find the masks.
+
+        Args:
+            folder: Folder of the photos.
+            names: The photos, relative to the folder.
+            masks: Folder of masks; None for none.
+            alpha: What transparency does.
+            orientation: Whether photos are read upright or as they are stored.
+
+        Raises:
+            InputError: The folder of masks does not exist or holds no mask of these photos.
+            ValueError: `alpha` is not a value of `AlphaUse`.
+        """
+        if alpha not in get_args(AlphaUse):
+            raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaUse))}, got {alpha!r}")
+        self._folder, self._names, self._alpha = folder, names, alpha
+        self._orientation: Orientation = orientation
+        self._masks: dict[str, Path] = {}
+        self._said: dict[str, set[str]] = defaultdict(set)
+        if masks is not None:
+            self._find(Path(masks))
+
+    def read(self, name: str) -> MaskedPhoto:
+        """Read a photo and combine its mask with its transparency.
+
+        Raises:
+            ImageError: The photo or its mask is unreadable, or they differ in size.
+        """
+        photo = read_photo(self._folder / name, self._orientation)
+        if photo.num_frames > 1:
+            self._said["photo(s) of several frames or pages, of which the first is used"].add(name)
+        mask = self._mask(name, photo)
+        if photo.alpha is not None and not photo.alpha.all() and self._alpha == "mask":
+            self._said["photo(s) with transparent pixels, which hold no features"].add(name)
+            mask = photo.alpha if mask is None else mask & ((photo.alpha > 0) * mask.dtype.type(255))
+        if mask is not None and not mask.any():
+            self._said[_EMPTY].add(name)
+        return MaskedPhoto(image=photo.image, mask=mask)
+
+    def check(self) -> None:
+        """Check, once all photos were read, that at least two have pixels that are kept.
+
+        Raises:
+            InputError: They have not.
+        """
+        empty = self._said[_EMPTY]
+        if len(self._names) - len(empty) < 2 <= len(self._names):
+            raise InputError(
+                f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask they "
+                "are white, or have any other value but 0, and in a photo they are not transparent"
+            )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences, with names, on masks without a photo, photos without a mask, transparency and frames."""
+        return tuple(named(what, names) for what, names in sorted(self._said.items()) if names)
+
+    def _find(self, masks: Path) -> None:
+        if not masks.is_dir():
+            raise InputError(f"{masks}: no such folder of masks")
+        if masks.resolve() == self._folder.resolve():
+            raise InputError(
+                f"{masks}: is the folder of the photos; put the masks into a folder of their own"
+            )
+        for name in self._names:
+            candidates = (masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png"))
+            path = next((path for path in candidates if path.is_file()), None)
+            if path is None:
+                self._said["photo(s) without a mask, used whole"].add(name)
+            else:
+                self._masks[name] = path
+        if not self._masks:
+            raise InputError(_no_mask(masks, self._names[0]))
+        used = set(self._masks.values())
+        others = {name for name in find_images(masks).names if masks / name not in used}
+        self._said["mask(s) of no photo ignored"] = others
+
+    def _mask(self, name: str, photo: Photo) -> GrayImage | None:
+        path, shape = self._masks.get(name), photo.image.shape[:2]
+        if path is None:
+            return None
+        is_stored = self._orientation == "stored"
+        mask, orientation = read_stored_mask(path)
+        if orientation != 1:
+            mask = upright(mask, orientation)
+            mask = as_stored(mask, photo.orientation) if is_stored else mask
+        elif photo.orientation != 1:
+            turned = (as_stored if is_stored else upright)(mask, photo.orientation)
+            if mask.shape == turned.shape == shape:
+                self._said[
+                    f"mask(s) taken as {self._orientation}, because their photo is turned and they fit both ways"
+                ].add(path.name)
+            elif turned.shape == shape:
+                mask = turned
+        if mask.shape != shape:
+            raise ImageError(
+                f"{path}: the mask is {mask.shape[::-1]} pixels, its {self._orientation} image {shape[::-1]}"
+            )
+        return mask
+
+
+_EMPTY = "photo(s) without features, because a mask or transparency covers all pixels"
+
+
+def _no_mask(masks: Path, name: str) -> str:
+    try:
+        held = f"only {named('image(s)', find_images(masks).names)}"
+    except InputError:
+        held = "no image"
+    stem = PurePosixPath(name).with_suffix(".png")
+    return (
+        f"{masks}: holds no mask of any photo, {held}; the mask of {name} is named {name}.png or {stem}, in the "
+        "same subfolder as the photo"
+    )
