@@ -165,11 +165,9 @@ class _Stored(NamedTuple):
 
 def _read(path: str | Path) -> _Stored:
     with opened(path) as file:
+        is_deep = _is_deep(file)  # first, because Pillow forgets the depth when it decodes
         orientation = exif_orientation(file)
-        values, alpha = (
-            _deep_values(file, path),
-            None,
-        )  # first, because Pillow forgets the depth when it decodes
+        values, alpha = _deep_values(file, path) if is_deep else None, None
         # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
         num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
         if values is None:
@@ -199,8 +197,6 @@ def _values(file: PillowImage.Image) -> tuple[Shaped[np.ndarray, "_ _ *channels"
 
 def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray, "_ _ _"] | None:
     """RGB or RGBA of 16 bits per channel, of which Pillow keeps the upper eight; None for other images."""
-    if file.mode.startswith(_WIDE) or not _is_deep(file):
-        return None
     file.load()  # OpenCV takes half a file for a whole one, Pillow does not
     found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.dtype != np.uint16 or found.ndim != 3:
@@ -209,6 +205,8 @@ def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray
 
 
 def _is_deep(file: PillowImage.Image) -> bool:
+    if file.mode.startswith(_WIDE):
+        return False
     arguments = [tile[3] for tile in getattr(file, "tile", [])]
     parts = [part for one in arguments for part in (one if isinstance(one, tuple) else (one,))]
     if file.format == "PPM":

@@ -132,9 +132,8 @@ class MaskedPhotos:
         elif photo.orientation != 1:
             turned = (as_stored if is_stored else upright)(mask, photo.orientation)
             if mask.shape == turned.shape == shape:
-                self._said[
-                    f"mask(s) taken as {self._orientation}, because their photo is turned and they fit both ways"
-                ].add(path.name)
+                as_read = f"mask(s) taken as {self._orientation}"
+                self._said[f"{as_read}, because their photo is turned and they fit both ways"].add(path.name)
             elif turned.shape == shape:
                 mask = turned
         if mask.shape != shape:
