@@ -3,6 +3,7 @@
 A pose is a `pycolmap.Rigid3d` called `cam_from_world`: `x_in_cam = R @ x_in_world + t`.
 """
 
+from copy import copy
 from dataclasses import dataclass
 from itertools import combinations, product
 
@@ -93,6 +94,15 @@ def reprojection_errors(
     """Distances in pixels between points and their projected 3D points; infinite where there is none."""
     errors = np.linalg.norm(project(points3D_in_world, cam_from_world, camera) - points2D, axis=1)
     return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def resized_camera(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera:
+    """The camera of an image whose sides are multiplied by a factor."""
+    resized, params = copy(camera), camera.params.copy()
+    params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] *= factor
+    resized.params = params.tolist()
+    resized.width, resized.height = round(camera.width * factor), round(camera.height * factor)
+    return resized
 
 
 def motions(points3D_in_cam: Points3D) -> Float64[np.ndarray, "n 3 6"]:

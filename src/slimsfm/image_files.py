@@ -107,8 +107,7 @@ def find_images(folder: str | Path, *, leave_out: Path | None = None) -> FoundIm
     if not images:
         readable = ", ".join(_FORMATS)
         raise InputError("; ".join([f"{folder}: contains no image that can be read ({readable})", *notes]))
-    for name in images:
-        _check_name(folder, name)
+    check_names(folder, images)
     return FoundImages(names=tuple(sorted(images)), notes=notes)
 
 
@@ -177,7 +176,7 @@ def _files(folder: Path, leave_out: Path | None, skipped: dict[str, list[str]]) 
 
 
 def _walk(folder: Path, leave_out: Path | None, skipped: dict[str, list[str]]) -> Iterator[Path]:
-    """All files below a folder that are not hidden; linked folders last, so that they cannot form a circle."""
+    """All files below a folder that are not hidden; linked folders last, so that no circle is walked."""
     left_out = os.path.realpath(leave_out) if leave_out else ""
     entered, linked = set(), [folder]
     for start in linked:  # grows
@@ -202,10 +201,22 @@ def _walk(folder: Path, leave_out: Path | None, skipped: dict[str, list[str]]) -
                     yield entry
 
 
-def _check_name(folder: Path, name: str) -> None:
-    """Refuse names that COLMAP's and hloc's lists of images, one a line, cannot hold."""
-    if any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name):
-        raise InputError(
-            f"{folder}: the name {name!r} has a line break or another character that text files of names "
-            "cannot hold; rename the image"
-        )
+def check_names(folder: Path, names: Iterable[str]) -> None:
+    """Check that the files that hold names of images can hold these.
+
+    Raises:
+        InputError: A name has a character that ends a line or is no text, or hloc's files, in which "/" is "-",
+            cannot tell two names apart.
+    """
+    keys: dict[str, str] = {}
+    for name in names:
+        if any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name):
+            raise InputError(
+                f"{folder}: the name {name!r} has a line break or another character that text files "
+                "of names cannot hold; rename the image"
+            )
+        other = keys.setdefault(name.replace("/", "-"), name)
+        if other != name:
+            raise InputError(
+                f"{folder}: {other} and {name} have the same name in files of matches (/ is -); rename one"
+            )

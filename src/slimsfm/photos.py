@@ -6,6 +6,7 @@ are from 0 (black) to 1 (white) unless one is larger, and then count as integers
 that are no number are black.
 """
 
+import logging
 import re
 import struct
 import warnings
@@ -30,6 +31,7 @@ Orientation = Literal["upright", "stored"]
 """Which pixels of an image file: turned upright according to its EXIF orientation, or as they are stored, as
 COLMAP and hloc read them."""
 
+_LOGGER = logging.getLogger(__name__)
 _UNREADABLE = (UnidentifiedImageError, OSError, EOFError, ValueError, SyntaxError, RuntimeError)
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _WIDE = "I", "F"  # first letters of Pillow's modes of more than eight bits
@@ -43,7 +45,7 @@ class Photo:
     """RGB."""
 
     alpha: GrayImage | None
-    """0 where the image is fully transparent; None if it is opaque everywhere."""
+    """0 where the image is fully transparent, 255 elsewhere; None if it is nowhere."""
 
     orientation: int
     """EXIF orientation of the file, from 1 to 8; 1 if it has none."""
@@ -52,17 +54,20 @@ class Photo:
     """Number of frames or pages in the file, of which this is the first."""
 
 
-def read_photo(path: str | Path, orientation: Orientation = "upright") -> Photo:
+def read_photo(path: str | Path, orientation: Orientation = "upright", *, warn: bool = True) -> Photo:
     """Read an image of any format, color mode and bit depth.
 
     Args:
-        path: The file.
+        path: The file; of several frames or pages the first is read.
         orientation: Whether to turn the pixels upright by the EXIF orientation of the file.
+        warn: Log a warning if there are several.
 
     Raises:
         ImageError: The file is missing, not a complete image, or too large.
     """
     stored = _read(path)
+    if warn and stored.num_frames > 1:
+        _LOGGER.warning("%s: the first of %d frames or pages is used", path, stored.num_frames)
     image, alpha = _as_rgb(stored.values), stored.alpha
     if orientation == "upright":
         image = upright(image, stored.orientation)
@@ -71,11 +76,7 @@ def read_photo(path: str | Path, orientation: Orientation = "upright") -> Photo:
 
 
 def read_image(path: str | Path, orientation: Orientation = "upright") -> Image:
-    """Read an image as RGB; transparency is ignored, and of several frames the first is read.
-
-    Args:
-        path: The file.
-        orientation: Whether to turn the pixels upright by the EXIF orientation of the file.
+    """Read an image as RGB like `read_photo`, without its transparency.
 
     Raises:
         ImageError: As in `read_photo`.
@@ -176,13 +177,15 @@ def _read(path: str | Path) -> _Stored:
                 values = as_stored(values, orientation)
                 alpha = None if alpha is None else as_stored(alpha, orientation)
         elif values.ndim == 3 and values.shape[2] == 4:
-            values, alpha = values[..., :3], np.where(values[..., 3], 255, 0).astype(np.uint8)
-        if alpha is not None and alpha.all():
-            alpha = None
+            values, alpha = values[..., :3], values[..., 3]
+        if alpha is not None:
+            alpha = None if alpha.all() else np.where(alpha, 255, 0).astype(np.uint8)
         return _Stored(values, alpha, orientation, num_frames)
 
 
-def _values(file: PillowImage.Image) -> tuple[Shaped[np.ndarray, "_ _ *channels"], GrayImage | None]:
+def _values(
+    file: PillowImage.Image,
+) -> tuple[Shaped[np.ndarray, "_ _ *channels"], Shaped[np.ndarray, "_ _"] | None]:
     """Gray or RGB values and alpha as Pillow decodes them."""
     if file.mode.startswith(_WIDE):
         return np.array(file), None

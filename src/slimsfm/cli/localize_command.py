@@ -8,6 +8,7 @@ from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError
+from slimsfm.image_files import find_images
 from slimsfm.localization import (
     Localization,
     LocalizationOptions,
@@ -20,7 +21,7 @@ from slimsfm.localization.cameras import (
     read_camera,
     read_gravity,
 )
-from slimsfm.localization.pose_files import write_object_poses, write_poses, writer_for
+from slimsfm.localization.pose_files import check_names_for, write_object_poses, write_poses, writer_for
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import shown
 
@@ -63,6 +64,7 @@ def localize(
         raise InputError(f"workers must be at least 1, got {workers}")
     if gravity and (also or localization.focal != "known"):
         raise InputError("gravity goes with one map and a known focal length; leave out also or focal")
+    check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
     localizers = {name: Localizer(read_map(path), localization) for name, path in _named(map, *also).items()}
     given = read_camera(camera) if camera else None
     if also:

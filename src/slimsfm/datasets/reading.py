@@ -102,7 +102,7 @@ def read_text(path: Path) -> str:
         InputError: The file is missing or not text.
     """
     try:
-        return path.read_text()
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise InputError(f"{path} cannot be read: there is no such file") from error
     except (OSError, UnicodeDecodeError) as error:

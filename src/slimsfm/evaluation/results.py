@@ -18,7 +18,7 @@ from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.map import Map
-from slimsfm.photos import Orientation, read_image
+from slimsfm.photos import Orientation, read_image, read_photo
 from slimsfm.progress import ProgressBar, silent
 
 STAGES = ("extract", "match", "pose")
@@ -365,9 +365,9 @@ def prepare_queries(
     extractor = load_extractor(map.info.extractor, map.info.extractor_options)
     prepared = []
     for query in progress(queries, "extract query features"):
-        image = read_image(query.path, query.orientation)
+        photo = read_photo(query.path, query.orientation)
         start = perf_counter()
-        features = extractor.extract(image)
+        features = extractor.extract(photo.image, photo.alpha)
         seconds = perf_counter() - start
         prepared.append(PreparedQuery(query=query, features=features, extract_seconds=seconds))
     return prepared

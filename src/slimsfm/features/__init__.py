@@ -1,6 +1,15 @@
 """Local features: data types, extractors, matchers and descriptor matching."""
 
-from slimsfm.features.base import Extractor, Features, Matcher, NearestOptions, image_colors, unit_rows
+from slimsfm.features.base import (
+    Extractor,
+    Features,
+    Matcher,
+    NearestOptions,
+    image_colors,
+    shrink_factor,
+    unit_rows,
+    unmasked,
+)
 from slimsfm.features.nearest import match_nearest
 from slimsfm.features.registry import EXTRACTORS, MATCHERS, load_extractor, load_matcher
 
@@ -15,5 +24,7 @@ __all__ = [
     "load_extractor",
     "load_matcher",
     "match_nearest",
+    "shrink_factor",
     "unit_rows",
+    "unmasked",
 ]

@@ -1,10 +1,11 @@
 """Local features, and the protocols of extractors and matchers."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int64, Shaped, UInt8
+from jaxtyping import Bool, Float, Float32, Int64, Shaped, UInt8
 
 from slimsfm.arrays import Descriptors, GrayImage, Image, IndexPairs
 
@@ -97,12 +98,34 @@ class Matcher(Protocol):
         ...
 
 
+def shrink_factor(extractor_options: Mapping, width: int, height: int) -> float:
+    """Pixels of an image per pixel in which its features are found; 1 unless its extractor shrinks it.
+
+    Errors of keypoints grow with this factor, so limits in pixels are multiplied by it.
+
+    Args:
+        extractor_options: The extractor's `options`; without `max_image_size`, it shrinks nothing.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
+    """
+    largest = extractor_options.get("max_image_size")
+    return max(1.0, max(width, height) / largest) if largest else 1.0
+
+
 def unit_rows(descriptors: Shaped[np.ndarray, "n d"]) -> Descriptors:
     """Scale descriptors to unit length, so that dot products compare them. Rows of zeros stay zero."""
     rows = np.array(descriptors, np.float32, order="C")
     lengths = np.sqrt(np.einsum("nd,nd->n", rows, rows))
     rows /= np.maximum(lengths, np.float32(1e-12))[:, None]
     return rows
+
+
+def unmasked(keypoints: Float[np.ndarray, "n 2"], mask: GrayImage | None) -> Bool[np.ndarray, " n"]:
+    """Which keypoints lie on pixels of a mask that are not 0; all do if there is no mask."""
+    if mask is None:
+        return np.ones(len(keypoints), dtype=bool)
+    columns, rows = np.clip(keypoints.astype(np.int64), 0, np.array(mask.shape[::-1]) - 1).T
+    return mask[rows, columns] > 0
 
 
 def image_colors(

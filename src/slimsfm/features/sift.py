@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from slimsfm.arrays import GrayImage, Image
-from slimsfm.features.base import Features
+from slimsfm.features.base import Features, unmasked
 from slimsfm.photos import shrink
 
 
@@ -57,8 +57,10 @@ class Sift:
         scale = min(1.0, self.max_image_size / max(height, width))
         gray = shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8), self.max_image_size)
         small_mask = None if mask is None else shrink(mask, self.max_image_size)
+        # OpenCV counts features before it applies the mask; with one, those to keep are chosen below.
+        most = self.max_features if mask is None else 0
         detector = cv2.SIFT.create(
-            self.max_features, contrastThreshold=self.contrast_threshold, enable_precise_upscale=True
+            most, contrastThreshold=self.contrast_threshold, enable_precise_upscale=True
         )
         found, descriptors = detector.detectAndCompute(gray, small_mask)
         if descriptors is None:
@@ -69,10 +71,11 @@ class Sift:
         frames = np.array([(keypoint.size, keypoint.angle) for keypoint in found], np.float32).reshape(-1, 2)
         # OpenCV's size is a diameter, its angle in degrees.
         frames *= np.array([0.5 / scale, np.pi / 180], np.float32)
+        keypoints, order = pixels * factors, np.argsort(-scores, kind="stable")
         # OpenCV may return a few more than requested if responses tie.
-        order = np.argsort(-scores, kind="stable")[: self.max_features]
+        order = order[unmasked(keypoints, mask)[order]][: self.max_features]
         return Features(
-            keypoints=(pixels * factors)[order],
+            keypoints=keypoints[order],
             descriptors=root_sift(descriptors)[order],
             scores=scores[order],
             image_size=(width, height),

@@ -17,7 +17,7 @@ from scipy.sparse import triu
 from slimsfm.arrays import Ids, Points2D
 from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
-from slimsfm.geometry import corner_error, project
+from slimsfm.geometry import corner_error, project, resized_camera
 from slimsfm.localization.matching import matching_with
 from slimsfm.localization.strategy import MatchingOptions, Query
 from slimsfm.mapping.map import Map, observed
@@ -218,9 +218,10 @@ class PosedReferences:
     def error(self, index: int, points2D: Points2D, points: Ids) -> float:
         """Relative corner error of an image's pose, estimated from pixels and the rows of their points."""
         name = self.names[index]
-        pose = estimate_pose(
-            points2D, self.map.points3D_in_world[points], self.map.camera(name), self._ransac
-        )
+        camera, factor = self.map.camera(name), self.map.shrink_factor(name)
+        if factor > 1:
+            points2D, camera = points2D / factor, resized_camera(camera, 1 / factor)
+        pose = estimate_pose(points2D, self.map.points3D_in_world[points], camera, self._ransac)
         if pose is None:
             return np.inf
         return corner_error(pose.cam_from_world, self.map.images[name].cam_from_world(), self.map.box)
@@ -339,6 +340,7 @@ class LocalizeEdges:
             features=features,
             camera=map_.camera(name),
             image=map_.photos.get(name),
+            shrink_factor=map_.shrink_factor(name),
         )
 
 

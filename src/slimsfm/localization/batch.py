@@ -9,13 +9,13 @@ from typing import NamedTuple, get_args
 
 import pycolmap
 
-from slimsfm.arrays import Image
+from slimsfm.arrays import GrayImage, Image
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.features import Features
-from slimsfm.image_files import list_images
+from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.photos import Orientation, read_image
+from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
 
@@ -42,6 +42,7 @@ class MultiLocalizer:
         image: Image,
         cameras: Mapping[str, pycolmap.Camera | None] | None = None,
         gravity: Gravity | None = None,
+        mask: GrayImage | None = None,
     ) -> dict[str, Localization]:
         """Search one image for every object.
 
@@ -50,6 +51,7 @@ class MultiLocalizer:
             cameras: Intrinsics by name of the object; where they are missing or None, those of the object's
                 map are used.
             gravity: As in `Localizer.localize`; all maps must share one frame.
+            mask: As in `Localizer.localize`.
 
         Returns:
             The outcome by name of the object, in the order of the localizers. The image shows the objects
@@ -65,7 +67,7 @@ class MultiLocalizer:
             info, start = localizer.map.info, perf_counter()
             key = repr((info.extractor, sorted(info.extractor_options.items())))
             if key not in extracted:
-                extracted[key] = localizer.extractor.extract(image)
+                extracted[key] = localizer.extractor.extract(image, mask)
             seconds = perf_counter() - start
             one = localizer.localize_features(extracted[key], camera, gravity)
             found[name] = replace(one, seconds=replace(one.seconds, extract=seconds))
@@ -86,7 +88,7 @@ def localize_images(
 ) -> dict[str, Localization]:
     """Localize the images of a folder.
 
-    Results do not depend on the number of workers.
+    Results do not depend on the number of workers. Transparent pixels of an image hold no features.
 
     Args:
         localizer: Localizer of the map.
@@ -158,6 +160,7 @@ def _localize(
 def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | None) -> list[_Task]:
     """All images with their intrinsics, so that an image without intrinsics fails before the work begins."""
     folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
+    check_names(folder, names)
     return [
         _Task(
             name=name,
@@ -179,6 +182,7 @@ def _localize_one(
     for orientation in get_args(Orientation):
         alike = {k: one for k, one in localizer.localizers.items() if one.map.info.orientation == orientation}
         if alike:
-            image = read_image(task.path, orientation)
-            found |= MultiLocalizer(alike).localize(image, task.cameras, gravity.get(task.name))
+            photo = read_photo(task.path, orientation)
+            multi, down = MultiLocalizer(alike), gravity.get(task.name)
+            found |= multi.localize(photo.image, task.cameras, down, photo.alpha)
     return {key: found[key] for key in localizer.localizers}

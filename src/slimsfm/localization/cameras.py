@@ -138,7 +138,7 @@ def read_gravity(path: str | Path) -> dict[str, Gravity]:
     """
     path = Path(path)
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_text(encoding="utf-8"))
         world = _vector(data["world"])
         return {str(name): Gravity(in_world=world, in_cam=_vector(v)) for name, v in data["images"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -1,14 +1,14 @@
 """Localize a query image against one map."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 import pycolmap
 
-from slimsfm.arrays import Image, Points2D, Points3D
-from slimsfm.features import Features, load_extractor, unit_rows
+from slimsfm.arrays import GrayImage, Image, Points2D, Points3D
+from slimsfm.features import Features, load_extractor, shrink_factor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
 from slimsfm.localization.matching import extract_near
@@ -166,7 +166,11 @@ class Localizer:
         self._search = Search(map, self._strategy, options.ransac, options.focal)
 
     def localize(
-        self, image: Image, camera: pycolmap.Camera | None = None, gravity: Gravity | None = None
+        self,
+        image: Image,
+        camera: pycolmap.Camera | None = None,
+        gravity: Gravity | None = None,
+        mask: GrayImage | None = None,
     ) -> Localization:
         """Localize one image.
 
@@ -176,13 +180,14 @@ class Localizer:
                 images share one of the same aspect ratio. A guess suffices if the focal length is not known.
             gravity: Direction of gravity in the map and in the image, as a phone measures it; used only if
                 the focal length is known.
+            mask: Of the size of the image; features where it is 0 are not used.
 
         Raises:
             ValueError: The camera has another image size, or none is given and the map's does not fit.
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        features = self.extractor.extract(image)
+        features = self.extractor.extract(image, mask)
         seconds, query = perf_counter() - start, self._query(features, camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), seconds)
 
@@ -208,8 +213,9 @@ class Localizer:
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        features = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
-        seconds, query = perf_counter() - start, self._query(features, camera, image)
+        found = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
+        seconds, query = perf_counter() - start, self._query(found.features, camera, image)
+        query = replace(query, shrink_factor=found.shrink_factor)
         return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
 
     @property
@@ -264,6 +270,7 @@ class Localizer:
             features=features,
             camera=camera,
             image=image,
+            shrink_factor=shrink_factor(self.extractor.options, camera.width, camera.height),
         )
 
     def camera_of(self, image: Image, given: pycolmap.Camera | None = None) -> pycolmap.Camera:

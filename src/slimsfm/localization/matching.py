@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
@@ -19,6 +19,7 @@ from slimsfm.features import (
     load_extractor,
     load_matcher,
     match_nearest,
+    shrink_factor,
     unit_rows,
 )
 from slimsfm.geometry import Box, project
@@ -159,13 +160,23 @@ _RADIUS = 0.08  # of the longer side of the image: largest distance between a ke
 _MAX_RATIO = 0.9  # few candidates are near a projection, so the ratio test may be lenient
 
 
+class NearFeatures(NamedTuple):
+    """Features of a part of an image."""
+
+    features: Features
+    """In pixels of the whole image."""
+
+    shrink_factor: float
+    """Pixels of the image per pixel in which they were found."""
+
+
 def extract_near(
     extractor: Extractor,
     image: Image,
     box: Box,
     cam_from_world: pycolmap.Rigid3d,
     camera: pycolmap.Camera,
-) -> Features:
+) -> NearFeatures:
     """Extract features in the part of an image that shows a box and a margin, in pixels of the whole image.
 
     If the box is out of sight, the part is the one at the edge of the image that is nearest to it.
@@ -174,7 +185,10 @@ def extract_near(
     found = extractor.extract(np.ascontiguousarray(image[rows, columns]))
     shift = np.array([columns.start, rows.start], np.float32)
     size = (camera.width, camera.height)
-    return replace(found, keypoints=found.keypoints + shift, image_size=size)
+    return NearFeatures(
+        features=replace(found, keypoints=found.keypoints + shift, image_size=size),
+        shrink_factor=shrink_factor(extractor.options, *found.image_size),
+    )
 
 
 def _window_of_box(

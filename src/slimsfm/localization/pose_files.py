@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TextIO
 
@@ -27,13 +27,15 @@ def write_poses(path: str | Path, results: Results, *, overwrite: bool = False) 
     """Write poses in the format that the name of the file asks for.
 
     - `.json` and `.csv` hold every query, localized or not, with times.
-    - `images.txt` holds the localized queries in COLMAP's format. COLMAP reads a name up to its first space.
+    - `images.txt` holds the localized queries in COLMAP's format, which has no names with spaces.
     - Any other `.txt`, and `.tum`, holds the localized queries as a TUM trajectory: one line
       `index tx ty tz qx qy qz qw` per pose of a camera in the world; the index counts all queries.
 
     Raises:
-        OutputError: The suffix is unknown, or the file exists or cannot be written.
+        OutputError: The suffix is unknown, the format cannot hold a name, or the file exists or cannot be
+            written.
     """
+    check_names_for(path, results)
     _write(Path(path), [({"name": name}, one) for name, one in results.items()], overwrite=overwrite)
 
 
@@ -56,7 +58,10 @@ def write_object_poses(path: str | Path, results: ObjectResults, *, overwrite: b
 
 def _write(path: Path, rows: list[_Row], *, overwrite: bool) -> None:
     write = writer_for(path)
-    with replacing(path, overwrite=overwrite) as partial, partial.open("w", newline="") as file:
+    with (
+        replacing(path, overwrite=overwrite) as partial,
+        partial.open("w", newline="", encoding="utf-8") as file,
+    ):
         write(file, rows)
 
 
@@ -76,6 +81,20 @@ def writer_for(path: str | Path, *, several: bool = False) -> Callable[[TextIO, 
             f"{path}: poses are written as .json, .csv, .txt or .tum (TUM), or images.txt (COLMAP)"
         )
     return _WRITERS[path.suffix]
+
+
+def check_names_for(path: str | Path, names: Iterable[str]) -> None:
+    """Check that the format that a path asks for can hold the names of the queries.
+
+    Raises:
+        OutputError: It cannot: COLMAP reads a name in images.txt up to its first space.
+    """
+    for name in names if Path(path).name == "images.txt" else ():
+        if name.split() != [name]:
+            raise OutputError(
+                f"{path}: COLMAP's images.txt cannot hold a name with spaces, such as {name!r}; rename it "
+                "or write .json or .csv"
+            )
 
 
 def _write_json(file: TextIO, rows: list[_Row]) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pycolmap
 
-from slimsfm.geometry import project
+from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import FocalLength
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
@@ -15,6 +15,7 @@ from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strat
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
 from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
+from slimsfm.pose.types import with_focal_length
 
 SURE = 0.95
 """Confidence from which a pose is sure."""
@@ -134,15 +135,20 @@ class Search:
         gravity: Gravity | None = None,
     ) -> RoundResult:
         matched = perf_counter()
-        posed = self._estimate(query, matches, camera, gravity)
+        shrunk = _Shrunk.of(query, matches, camera)
+        posed = self._estimate(shrunk.query, shrunk.matches, shrunk.camera, gravity)
         pose, evidence = posed.pose, None
         if pose is not None:
-            evidence = self._verifier.evidence(query, matches, pose, posed.camera)
-            pose = replace(pose, confidence=evidence.confidence)
+            evidence = self._verifier.evidence(shrunk.query, shrunk.matches, pose, posed.camera)
+            pose = replace(
+                pose,
+                confidence=evidence.confidence,
+                camera=pose.camera and shrunk.enlarged(pose.camera, camera),
+            )
         return RoundResult(
             matches=matches,
             pose=pose,
-            camera=posed.camera,
+            camera=camera if posed.camera is shrunk.camera else shrunk.enlarged(posed.camera, camera),
             evidence=evidence,
             match_seconds=matched - start,
             pose_seconds=perf_counter() - matched,
@@ -157,6 +163,31 @@ class Search:
         focal = FocalPrior.of(camera, _APPROXIMATE if self._focal == "approximate" else None)
         pose = estimate_pose(points2D, points3D, camera, self._ransac, focal=focal)
         return _Posed(pose, camera if pose is None or pose.camera is None else pose.camera)
+
+
+class _Shrunk(NamedTuple):
+    """Matches in pixels in which keypoints were found, because that is what limits in pixels are for."""
+
+    query: Query
+    matches: PointMatches
+    camera: pycolmap.Camera
+    factor: float
+
+    @classmethod
+    def of(cls, query: Query, matches: PointMatches, camera: pycolmap.Camera) -> "_Shrunk":
+        factor = min(query.shrink_factor, max(matches.shrink_factor, 1.0))
+        if factor == 1:
+            return cls(query, matches, camera, factor)
+        if matches.points2D is not None:
+            matches = replace(matches, points2D=matches.points2D / factor)
+        small = resized_camera(camera, 1 / factor)
+        return cls(replace(query, keypoints=query.keypoints / factor, camera=small), matches, small, factor)
+
+    def enlarged(self, estimated: pycolmap.Camera, whole: pycolmap.Camera) -> pycolmap.Camera:
+        """The intrinsics of the image, with the focal length that was estimated for the shrunk one."""
+        if self.factor == 1:
+            return estimated
+        return with_focal_length(whole, self.factor * estimated.mean_focal_length())
 
 
 class _Posed(NamedTuple):

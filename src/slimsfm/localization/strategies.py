@@ -99,7 +99,7 @@ class ReferenceImages:
                 keypoints one by one.
         """
         chosen = range(len(self)) if rows is None else rows
-        return unite([self._matching.match(query, row, strongest) for row in chosen])
+        return unite([self._matching.match(query, row, strongest) for row in chosen], query.shrink_factor)
 
     def describe(self, query: Query) -> Descriptors:
         """Local descriptors of a query, of the kind that the images' global descriptors are made from."""
@@ -221,7 +221,7 @@ class Progressive:
             for _ in range(max(1, round(_GROWTH * len(tried)))):
                 tried.append(self._next(similarities, tried, agreeing))
                 parts.append(self._references.match(query, tried[-1:], _STRONGEST))
-            matches = unite(parts)
+            matches = unite(parts, query.shrink_factor)
             pose = yield matches
         yield self._references.match(query)
 

@@ -32,6 +32,9 @@ class Query:
     image: Image | None = None
     """The image, for strategies that use it; None if only its features are known."""
 
+    shrink_factor: float = 1.0
+    """Pixels of the image per pixel in which features were found; keypoints are as exact as the latter."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointMatches:
@@ -48,6 +51,9 @@ class PointMatches:
 
     points2D: Float64[np.ndarray, "_ 2"] | None = None
     """Pixels of keypoints that the strategy found itself; None if they are the query's."""
+
+    shrink_factor: float = np.inf
+    """Pixels of the image per pixel in which the strategy found `points2D`, if less than the query's."""
 
     def pixels(self, query: Query) -> Points2D:
         """Pixels of the matches in the query."""
@@ -126,12 +132,16 @@ class PoseGuided(Protocol):
         ...
 
 
-def unite(parts: Sequence[PointMatches]) -> PointMatches:
+def unite(parts: Sequence[PointMatches], pixel: float = 1.0) -> PointMatches:
     """Join matches from several sources and drop duplicates. Sorted by keypoint, then point.
 
     Matches at keypoints that strategies found themselves count as duplicates if they put the same point at
     the same position, to a pixel or two. One match at the mean position replaces them, so that it counts
     once.
+
+    Args:
+        parts: The matches.
+        pixel: Side of a pixel in which they were found, in pixels of the query.
     """
     keypoints = np.concatenate([np.zeros(0, np.int64), *_numbered_through(parts)])
     points = np.concatenate([np.zeros(0, np.int64), *(part.points for part in parts)])
@@ -139,13 +149,13 @@ def unite(parts: Sequence[PointMatches]) -> PointMatches:
     found = [part.points2D for part in parts if part.points2D is not None]
     references = sum(part.references for part in parts)
     if found:
-        return _merged(np.concatenate(found)[keypoints[first]], points[first], references)
+        return _merged(np.concatenate(found)[keypoints[first]], points[first], references, _SAME_PX * pixel)
     return PointMatches(keypoints=keypoints[first], points=points[first], references=references)
 
 
-def _merged(points2D: Points2D, points: Ids, references: int) -> PointMatches:
+def _merged(points2D: Points2D, points: Ids, references: int, side_px: float) -> PointMatches:
     """Merge matches that put a point at the same position; each remaining one gets its own keypoint."""
-    places = np.column_stack([points, np.round(points2D / _SAME_PX).astype(np.int64)])
+    places = np.column_stack([points, np.round(points2D / side_px).astype(np.int64)])
     unique, which, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
     sums = np.zeros((len(unique), 2))
     np.add.at(sums, which.ravel(), points2D)

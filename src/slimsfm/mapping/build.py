@@ -7,22 +7,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, get_args, runtime_checkable
 
-import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.exif import Exif, ignored_values, read_exif, read_orientation
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
-from slimsfm.features.store import FeatureFile
 from slimsfm.geometry import Box
-from slimsfm.image_files import find_images
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
+from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos, find_photos
 from slimsfm.mapping.model import estimate_box, read_box
-from slimsfm.mapping.orientation import turned_model, turned_pixels
+from slimsfm.mapping.orientation import TurnedFeatures, turned_model
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.sfm import (
     colmap_warnings,
@@ -33,6 +30,7 @@ from slimsfm.mapping.sfm import (
     verified_matches,
     write_database,
 )
+from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
@@ -131,9 +129,14 @@ def build_map(
         ReconstructionError: The images give no model.
     """
     images = Path(images)
-    names, notes = _photos_of(images, options.masks, known)
+    if known:
+        names, notes = sorted(known.cam_from_world), ()
+    else:
+        found = find_photos(images, options.masks)
+        names, notes = list(found.names), found.notes
     if len(names) < 2:
-        raise InputError(f"{images}: holds {len(names)} image; a map needs at least two")
+        few = f"{images}: holds {len(names)} image; a map needs at least two"
+        raise InputError("; ".join([few, *notes]))
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
     photos = MaskedPhotos(images, names, options.masks, options.alpha, options.orientation)
@@ -188,17 +191,6 @@ def _exif_orientations(work: "BuildWork", exifs: Mapping[str, Exif]) -> dict[str
         for name in work.names
     }
     return {name: tag for name, tag in tags.items() if tag != 1}
-
-
-def _photos_of(
-    images: Path, masks: Path | None, known: KnownPoses | None
-) -> tuple[list[str], tuple[str, ...]]:
-    """Names of the photos to use, and notes on what is skipped; masks in a subfolder are no photos."""
-    if known:
-        return sorted(known.cam_from_world), ()
-    inside = masks is not None and Path(masks).resolve() != images.resolve()
-    found = find_images(images, leave_out=masks if inside else None)
-    return list(found.names), found.notes
 
 
 @contextmanager
@@ -278,16 +270,20 @@ class ModelBuilder(Protocol):
 def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
     features, colors = extract_features(work.photos, names, extractor, output, work.progress)
-    database, sfm = _match(work, features, options), work.workspace / "sfm"
+    sideways = TurnedFeatures(features, dict.fromkeys(work.turned, 1))
+    shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
+    database, sfm = _match(work, features, shrunk, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
     if work.known:
         poses = work.known.cam_from_world
         model = triangulate(database, names, sfm, poses, seed=seed, progress=progress)
     else:
         model = reconstruct(database, names, sfm, seed=seed, progress=progress)
+    shrunk.enlarge(model, known_cameras=work.known is not None)
+    if work.turned:
         turns_back = {image.name: -int(image.name in work.turned) for image in model.images.values()}
         model = turned_model(model, turns_back)
-    put_keypoints(model, features)
+        put_keypoints(model, features)
     color_points(model, colors)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     return MapParts(extractor=extractor, model=model, features=features, matches=matches)
@@ -300,10 +296,11 @@ def _extractor(options: BuildOptions) -> Extractor:
     )
 
 
-def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Path:
+def _match(
+    work: BuildWork, features: Mapping[str, Features], shrunk: ShrunkImages, options: BuildOptions
+) -> Path:
     database = work.workspace / "database.db"
-    write_database(database, features, {**work.cameras, **work.turned})
-    _turn_keypoints(database, work)
+    write_database(database, shrunk.features, shrunk.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
         match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)
@@ -312,18 +309,6 @@ def _match(work: BuildWork, features: FeatureFile, options: BuildOptions) -> Pat
         matches = match_pairs_with(matcher, features, pairs, work.progress)
         verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
     return database
-
-
-def _turn_keypoints(database: Path, work: BuildWork) -> None:
-    """Turn the keypoints of pictures held sideways, so that they are of the camera of the others."""
-    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
-        for image in opened.read_all_images() if work.turned else []:
-            name = work.names[image.image_id - 1]
-            if name in work.turned:
-                keypoints = np.asarray(opened.read_keypoints(image.image_id), np.float64)[:, :2]
-                size = work.cameras[name].width, work.cameras[name].height
-                turned = turned_pixels(keypoints, size, 1).astype(np.float32)
-                opened.update_keypoints(image.image_id, turned)
 
 
 def _check_not_turned(work: BuildWork, options: BuildOptions) -> None:

@@ -76,7 +76,7 @@ def read_query_names(path: str | Path) -> list[str]:
     if path.is_dir():
         return list_images(path)
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: neither a folder of images nor a readable list of names") from error
     names = [_name(line, path) for line in lines if line.strip() and not line.startswith("#")]
@@ -127,4 +127,4 @@ def _as_in_hloc(features: Features) -> Features:
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:
-    path.write_text("".join(f"{line}\n" for line in lines))
+    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Int64
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
 from slimsfm.exif import read_orientation
-from slimsfm.features import Features
+from slimsfm.features import Features, shrink_factor
 from slimsfm.features.store import FeatureFile, MatchFile
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import redescribe
@@ -22,7 +22,8 @@ from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
 _MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
-_MAX_EPIPOLAR_ERROR_PX = 4.0
+_MAX_EPIPOLAR_ERROR_PX = 4.0  # in pixels in which features were found
+_LONGEST_PX = {"max_image_size": 1600}  # hloc shrinks larger images to this or less before it finds features
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,7 +259,10 @@ def _consistent_matches(
         b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
         essential = pycolmap.essential_matrix_from_pose(b_from_a)
         squared = np.asarray(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
-        focal = min(cameras[a].mean_focal_length(), cameras[b].mean_focal_length())
+        focal = min(
+            camera.mean_focal_length() / shrink_factor(_LONGEST_PX, camera.width, camera.height)
+            for camera in (cameras[a], cameras[b])
+        )
         good = pairs[squared * focal**2 < _MAX_EPIPOLAR_ERROR_PX**2]
         if len(good) >= _MIN_INLIERS:
             verified[a, b] = good

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, Image, IndexPairs, Mask, Points3D
 from slimsfm.errors import MapError
-from slimsfm.features import Features, NearestOptions
+from slimsfm.features import Features, NearestOptions, shrink_factor
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
 from slimsfm.photos import Orientation
@@ -187,6 +187,11 @@ class Map:
     def camera(self, name: str) -> pycolmap.Camera:
         """The camera of a reference image."""
         return self.model.camera(self.images[name].camera_id)
+
+    def shrink_factor(self, name: str) -> float:
+        """Pixels of a reference image per pixel in which its features were found; 1 where that is unknown."""
+        camera = self.camera(name)
+        return shrink_factor(self.info.extractor_options, camera.width, camera.height)
 
     @cached_property
     def point3D_ids(self) -> Ids:

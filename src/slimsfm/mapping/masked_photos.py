@@ -14,7 +14,7 @@ from typing import Literal, get_args
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, InputError
-from slimsfm.image_files import find_images, named
+from slimsfm.image_files import FoundImages, find_images, named
 from slimsfm.photos import Orientation, Photo, as_stored, read_photo, read_stored_mask, upright
 
 AlphaUse = Literal["mask", "ignore"]
@@ -30,6 +30,16 @@ class MaskedPhoto:
 
     mask: GrayImage | None
     """0 where there are no features; None if they may be anywhere."""
+
+
+def find_photos(folder: Path, masks: Path | None) -> FoundImages:
+    """Find the images in a folder; masks in a subfolder of it are no photos.
+
+    Raises:
+        InputError: As in `find_images`.
+    """
+    inside = masks is not None and Path(masks).resolve() != folder.resolve()
+    return find_images(folder, leave_out=masks if inside else None)
 
 
 class MaskedPhotos:
@@ -71,13 +81,13 @@ class MaskedPhotos:
         Raises:
             ImageError: The photo or its mask is unreadable, or they differ in size.
         """
-        photo = read_photo(self._folder / name, self._orientation)
+        photo = read_photo(self._folder / name, self._orientation, warn=False)
         if photo.num_frames > 1:
             self._said["photo(s) of several frames or pages, of which the first is used"].add(name)
         mask = self._mask(name, photo)
-        if photo.alpha is not None and not photo.alpha.all() and self._alpha == "mask":
+        if photo.alpha is not None and self._alpha == "mask":
             self._said["photo(s) with transparent pixels, which hold no features"].add(name)
-            mask = photo.alpha if mask is None else mask & ((photo.alpha > 0) * mask.dtype.type(255))
+            mask = photo.alpha if mask is None else mask & photo.alpha
         if mask is not None and not mask.any():
             self._said[_EMPTY].add(name)
         return MaskedPhoto(image=photo.image, mask=mask)
@@ -91,8 +101,8 @@ class MaskedPhotos:
         empty = self._said[_EMPTY]
         if len(self._names) - len(empty) < 2 <= len(self._names):
             raise InputError(
-                f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask they "
-                "are white, or have any other value but 0, and in a photo they are not transparent"
+                f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask "
+                "they are white, or have any other value but 0, and in a photo they are not transparent"
             )
 
     @property
@@ -153,6 +163,6 @@ def _no_mask(masks: Path, name: str) -> str:
         held = "no image"
     stem = PurePosixPath(name).with_suffix(".png")
     return (
-        f"{masks}: holds no mask of any photo, {held}; the mask of {name} is named {name}.png or {stem}, in the "
-        "same subfolder as the photo"
+        f"{masks}: holds no mask of any photo, {held}; the mask of {name} is named {name}.png or {stem}, in "
+        "the same subfolder as the photo"
     )

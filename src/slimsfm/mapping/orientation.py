@@ -7,7 +7,7 @@ one becomes a model of the other without loss. EXIF orientations that mirror hav
 All turns are clockwise turns of the picture: one takes pixel (x, y) of a picture of height H to (H - y, x).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -99,6 +99,22 @@ def turned_features(features: Features, turns: int) -> Features:
         frames=None if frames is None else frames.astype(np.float32),
         image_size=(size[1], size[0]) if turns % 2 else size,
     )
+
+
+class TurnedFeatures(Mapping[str, Features]):
+    """Features by name of image, those of some images turned on access."""
+
+    def __init__(self, features: Mapping[str, Features], turns: Mapping[str, int]) -> None:
+        self._features, self._turns = features, turns
+
+    def __getitem__(self, name: str) -> Features:
+        return turned_features(self._features[name], self._turns.get(name, 0))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._features)
+
+    def __len__(self) -> int:
+        return len(self._features)
 
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:

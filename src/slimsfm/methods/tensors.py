@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from slimsfm.arrays import GrayImage, Image
-from slimsfm.features.base import Features
+from slimsfm.features.base import Features, unmasked
 from slimsfm.photos import shrink
 
 
@@ -55,14 +55,10 @@ def features_of(
         mask: Of the size of the image; keypoints where it is 0 are dropped.
         max_features: Largest number of features.
     """
-    width, height = taken.image_size
     pixels = (_numpy(keypoints) + np.float32(0.5)) * taken.factors
     strength = _numpy(scores)
     order = np.argsort(-strength, kind="stable")
-    if mask is not None:
-        columns, rows = np.clip(pixels.astype(np.int64), 0, (width - 1, height - 1)).T
-        order = order[mask[rows, columns][order] > 0]
-    order = order[:max_features]
+    order = order[unmasked(pixels, mask)[order]][:max_features]
     return Features(
         keypoints=pixels[order],
         descriptors=_numpy(descriptors)[order].astype(np.float16),

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask
-from slimsfm.geometry import corner_error, reprojection_errors
+from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import Target, unite
 from slimsfm.mapping.descriptors import quantize
@@ -129,10 +129,13 @@ class Trials:
 
     def _try(self, name: str, targets: list[Target]) -> _Trial:
         query, camera = self._left_out.query(name), self._map.camera(name)
+        factor = self._map.shrink_factor(name)  # limits in pixels are for those in which features were found
+        if factor > 1:
+            camera = resized_camera(camera, 1 / factor)
         start = self._clock()
         matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
         seconds = self._clock() - start
-        points2D = query.keypoints[matches.keypoints]
+        points2D = query.keypoints[matches.keypoints] / factor
         points3D = self._map.points3D_in_world[matches.points]
         true_pose = self._map.images[name].cam_from_world()
         errors = reprojection_errors(points2D, points3D, true_pose, camera)

@@ -119,13 +119,14 @@ def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.nda
         map.images[name].cam_from_world(),
         map.camera(name),
     )
-    return np.sort(matched[errors <= _MAX_ERROR_PX])
+    return np.sort(matched[errors <= _MAX_ERROR_PX * map.shrink_factor(name)])
 
 
 def _twists(map: Map, name: str, points: Ids) -> Twists:
     """Twists of an ideal pinhole camera: lens distortion hardly changes the information of a match."""
     in_cam = map.images[name].cam_from_world() * map.points3D_in_world[points]
-    twists = projection_jacobian(in_cam, map.camera(name).mean_focal_length())
+    focal_px = map.camera(name).mean_focal_length() / map.shrink_factor(name)
+    twists = projection_jacobian(in_cam, focal_px)
     return (twists * _in_diagonals(map.box.diagonal)).astype(np.float32)
 
 

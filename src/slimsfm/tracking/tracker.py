@@ -8,7 +8,8 @@ from typing import Literal
 import pycolmap
 
 from slimsfm.arrays import Image, Points2D
-from slimsfm.geometry import corner_error
+from slimsfm.features import shrink_factor
+from slimsfm.geometry import corner_error, resized_camera
 from slimsfm.localization import Localization, Localizer, Seconds
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking.background import BackgroundLocalization, BackgroundResult, Relocalizer, is_ambiguous
@@ -182,7 +183,10 @@ class Tracker:
 
     def _is_ambiguous(self, found: Localization, pose: PoseEstimate) -> bool:
         points2D, points3D = found.points2D[pose.inliers], found.points3D_in_world[pose.inliers]
-        return is_ambiguous(points2D, points3D, pose.cam_from_world, found.camera, self._box)
+        camera = found.camera
+        factor = shrink_factor(self._localizer.extractor.options, camera.width, camera.height)
+        small = resized_camera(camera, 1 / factor)
+        return is_ambiguous(points2D / factor, points3D, pose.cam_from_world, small, self._box)
 
     def _begun(self, localization: Localization, frame: GrayFrame) -> Track | None:
         """The track that begins with a localized frame; None where the localization has no pose."""

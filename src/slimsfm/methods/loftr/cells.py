@@ -14,8 +14,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 
-from slimsfm.arrays import IndexPairs, Mask, Points2D
-from slimsfm.features import Features
+from slimsfm.arrays import IndexPairs, Points2D
+from slimsfm.features import Features, unmasked
 from slimsfm.mapping.pairs import Matches, Pairs
 from slimsfm.progress import ProgressBar, silent
 
@@ -162,19 +162,12 @@ def in_tiles(pairs: Pairs, side: int) -> Pairs:
 
 
 def _within(matches: ImageMatches, mask1: PhotoMask | None, mask2: PhotoMask | None) -> ImageMatches:
-    kept = _unmasked(matches.points2D_1, mask1) & _unmasked(matches.points2D_2, mask2)
+    kept = unmasked(matches.points2D_1, mask1) & unmasked(matches.points2D_2, mask2)
     return ImageMatches(
         points2D_1=matches.points2D_1[kept],
         points2D_2=matches.points2D_2[kept],
         scores=matches.scores[kept],
     )
-
-
-def _unmasked(points2D: Points2D, mask: PhotoMask | None) -> Mask:
-    if mask is None:
-        return np.ones(len(points2D), dtype=bool)
-    columns, rows = np.clip(points2D.astype(np.int64), 0, np.array(mask.shape[::-1]) - 1).T
-    return mask[rows, columns] > 0
 
 
 _Places = Float64[np.ndarray, "_ 2"]

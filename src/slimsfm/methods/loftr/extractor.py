@@ -23,7 +23,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import PairChoice, Pairs, exhaustive_pairs, sequential_pairs
 from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher, Photo
 from slimsfm.methods.loftr.mapping import build_without_keypoints
-from slimsfm.photos import Orientation, read_image
+from slimsfm.photos import Orientation, read_photo
 from slimsfm.weights import find_weights
 
 _CACHED = 32  # encoded reference photos kept in memory: 45 MB each at 640 x 480
@@ -224,7 +224,7 @@ class PhotoFolder(Mapping[str, Photo]):
     def __getitem__(self, name: str) -> Photo:
         if name not in self._names:
             raise KeyError(name)
-        return read_image(self._folder / name, self._orientation)
+        return read_photo(self._folder / name, self._orientation, warn=False).image
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

@@ -7,7 +7,6 @@ References:
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +21,7 @@ from slimsfm.features import Features, image_colors
 from slimsfm.mapping.extraction import color_points
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
 from slimsfm.mapping.sfm import reconstruct, triangulate, verified_matches, write_database
+from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.methods.loftr.cells import (
     CellKeypoints,
     EncodedImage,
@@ -249,7 +249,7 @@ def build_without_keypoints(
     rough, matches = _reconstruct(cells, cameras, cam_from_world, workspace, seed, progress)
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
     if cam_from_world is None:
-        _adjust(refined.model)
+        _adjust(refined.model, max(1.0, float(np.median(list(cells.cell_px.values()))) / _CELL_PX))
     seen = refined.features.items()
     color_points(refined.model, {name: image_colors(photos[name], one.keypoints) for name, one in seen})
     return KeypointFreeModel(model=refined.model, features=refined.features, matches=refined.matches(matches))
@@ -269,60 +269,32 @@ def _reconstruct(
     """
     names, database = sorted(cells.features), workspace / "database.db"
     factors = {name: cells.cell_px[name] / _CELL_PX for name in names}
-    small = {name: _scaled(cameras[name], 1 / factors[name]) for name in names}
+    shrunk = ShrunkImages(whole=cells.features, whole_cameras=cameras, factors=factors)
+    small = shrunk.cameras
     for camera in small.values():
         camera.has_prior_focal_length |= cam_from_world is not None
-    coarse = {name: _shrunk(cells.features[name], factors[name]) for name in names}
-    write_database(database, coarse, small)
+    write_database(database, shrunk.features, small)
     verify_pairs(database, names, cells.matches, seed=seed, progress=progress)
     if cam_from_world is not None:
         model = triangulate(database, names, workspace / "sfm", cam_from_world, seed=seed, progress=progress)
     else:
         model = reconstruct(database, names, workspace / "sfm", seed=seed, progress=progress)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    _enlarge(model, cells, factors, cameras, exact=cam_from_world is not None)
+    shrunk.enlarge(model, known_cameras=cam_from_world is not None)
     return model, matches
 
 
-def _scaled(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera:
-    """The camera of the image after scaling it by a factor."""
-    scaled, params = copy(camera), camera.params.copy()
-    params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] *= factor
-    scaled.params = params.tolist()
-    scaled.width, scaled.height = round(camera.width * factor), round(camera.height * factor)
-    return scaled
+def _adjust(model: pycolmap.Reconstruction, scale_px: float) -> None:
+    """Adjust poses and focal lengths, which were estimated from the less exact cells.
 
-
-def _shrunk(features: Features, factor: float) -> Features:
-    return replace(features, keypoints=(features.keypoints / factor).astype(np.float32))
-
-
-def _enlarge(
-    model: pycolmap.Reconstruction,
-    cells: CellKeypoints,
-    factors: Mapping[str, float],
-    cameras: Mapping[str, pycolmap.Camera],
-    *,
-    exact: bool,
-) -> None:
-    """Scale a model from small images to the photos; with `exact`, it gets the given cameras unchanged."""
-    names = {cameras[name].camera_id: name for name in factors}
-    for camera_id, camera in model.cameras.items():
-        name = names[camera_id]
-        whole = cameras[name] if exact else _scaled(camera, factors[name])
-        camera.params = whole.params.tolist()
-        camera.width, camera.height = cameras[name].width, cameras[name].height
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        for point, xy in zip(image.points2D, cells.features[image.name].keypoints, strict=True):
-            point.xy = xy.astype(np.float64)
-
-
-def _adjust(model: pycolmap.Reconstruction) -> None:
-    """Adjust poses and focal lengths, which were estimated from the less exact cells."""
+    Args:
+        model: The model.
+        scale_px: Errors beyond it count less.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale_px
     options.ceres.solver_options.num_threads = 1
     with threadpool_limits(1):  # results must not depend on the number of threads
         pycolmap.bundle_adjustment(model, options)

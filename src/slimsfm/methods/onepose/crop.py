@@ -125,10 +125,20 @@ class FoundPoints(NamedTuple):
         parts = zip(self, (column[rest] for column in before), strict=True)
         return FoundPoints(*(np.concatenate(part) for part in parts))
 
-    def matches(self, references: int = 0) -> PointMatches:
-        """Convert to matches, each with its own keypoint."""
-        rows = np.arange(len(self.points), dtype=np.int64)
-        return PointMatches(keypoints=rows, points=self.points, references=references, points2D=self.points2D)
+    def matches(self, references: int = 0, pixel: float = np.inf) -> PointMatches:
+        """Convert to matches, each with its own keypoint.
+
+        Args:
+            references: Number of reference images that were matched.
+            pixel: Side of a pixel of the crop that they were found in, in pixels of the query.
+        """
+        return PointMatches(
+            keypoints=np.arange(len(self.points), dtype=np.int64),
+            points=self.points,
+            references=references,
+            points2D=self.points2D,
+            shrink_factor=pixel,
+        )
 
 
 def crop_region(image: Image, region: Region, size: int = CROP_PX) -> Crop:

@@ -90,21 +90,26 @@ class OnePoseStrategy:
         """
         located = LocatedObject(None, 0) if query.image is None else self._finder.find(query)
         first = self._look(query, located.region)
-        pose = yield first.matches(located.references)
+        pose = yield first.matches(located.references, self._pixel(located.region))
         region = pose and box_region(self._box, pose.cam_from_world, query.camera)
         if query.image is None or region == located.region:
             return
-        yield self._look(query, region).added_to(first).matches(located.references)
+        yield self._look(query, region).added_to(first).matches(located.references, self._pixel(region))
 
     def near(self, query: Query, near_cam_from_world: pycolmap.Rigid3d) -> PointMatches:
         """Look where a pose projects the box; use all features if the box is out of sight."""
-        return self._look(query, box_region(self._box, near_cam_from_world, query.camera)).matches()
+        region = box_region(self._box, near_cam_from_world, query.camera)
+        return self._look(query, region).matches(pixel=self._pixel(region))
 
     def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """The points that were mapped from about the direction of the camera."""
         return self._direct.visible_points(cam_from_world, agreeing)
+
+    def _pixel(self, region: Region | None) -> float:
+        """Side of a pixel of the crop around a region; infinite for the whole query, which is not cropped."""
+        return region.side / self._size if region else np.inf
 
     def _look(self, query: Query, region: Region | None) -> FoundPoints:
         """Find points in a region of a query, or in the whole query."""

@@ -95,20 +95,21 @@ class OnePosePlusStrategy:
         whole = _WHOLE.scaled(query.camera.width, query.camera.height)
         located = self._finder.find(query.image) if self._finder else LocatedObject(None, 0)
         first = self._look(query.image, located.region or whole)
-        pose = yield first.matches(located.references)
+        pose = yield first.matches(located.references, (located.region or whole).side / self._crop_px)
         if pose is not None:
             region = box_region(self._box, pose.cam_from_world, query.camera)
         else:
             region = whole if located.region else None
         if region is not None:
-            yield self._look(query.image, region).added_to(first).matches(located.references)
+            second = self._look(query.image, region).added_to(first)
+            yield second.matches(located.references, region.side / self._crop_px)
 
     def near(self, query: Query, near_cam_from_world: pycolmap.Rigid3d) -> PointMatches:
         """Look where a pose projects the box."""
         region = box_region(self._box, near_cam_from_world, query.camera)
         if query.image is None or region is None:
             return PointMatches.none()
-        return self._look(query.image, region).matches()
+        return self._look(query.image, region).matches(pixel=region.side / self._crop_px)
 
     def visible_points(
         self,
