@@ -205,8 +205,8 @@ def check_names(folder: Path, names: Iterable[str]) -> None:
     """Check that the files that hold names of images can hold these.
 
     Raises:
-        InputError: A name has a character that ends a line or is no text, or hloc's files, in which "/" is "-",
-            cannot tell two names apart.
+        InputError: A name has a character that ends a line or is no text, or two are one in files of hloc,
+            in which "/" is "-".
     """
     keys: dict[str, str] = {}
     for name in names:

@@ -241,14 +241,14 @@ def opened(path: str | Path) -> Iterator[PillowImage.Image]:
     Raises:
         ImageError: As in `read_photo`, here or within the context.
     """
-    with _reading(path):
-        with Path(path).open("rb") as raw:
-            head = raw.read(12)
+    # given a path, Pillow maps TIFF into memory and mixes up turned ones
+    with _reading(path), Path(path).open("rb") as raw:
+        head = raw.read(12)
         if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
             raise ImageError(f"{path}: {INSTALL_HEIC}")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PillowImage.DecompressionBombWarning)
-            file = PillowImage.open(path)
+            file = PillowImage.open(raw)
         with file:
             yield file
 

@@ -21,6 +21,7 @@ from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
+from slimsfm.mapping.masked_photos import MaskedPhotos
 from slimsfm.mapping.orientation import stored_model, turned_pose
 from slimsfm.photos import read_image
 from slimsfm.synthetic.scene import mapping_take
@@ -193,7 +194,7 @@ def test_the_orientation_survives_writing_and_old_maps_are_upright(upright, stor
 def test_a_model_of_upright_pictures_is_imported_as_such(upright, tmp_path):
     photos, map_ = upright
     map_.model.write(tmp_path)
-    with pytest.raises(ImageError, match=r"2\.png: 240x320 stored pixels.*320x240.*orientation='upright'"):
+    with pytest.raises(ImageError, match=r"2\.png: 240x320 pixels.*320x240.*orientation='upright'"):
         import_colmap(tmp_path, photos.folder)
     imported = import_colmap(tmp_path, options=ImportOptions(images=photos.folder, orientation="upright"))
     assert imported.info.exif_orientations == map_.info.exif_orientations
@@ -223,3 +224,24 @@ def test_the_commands_say_which_pixels_a_map_is_of(upright, tmp_path):
         size = again.camera(name).width, again.camera(name).height
         assert again.features[name].image_size == size
     assert again.matches.keys() == {pair for pair in map_.matches if set(pair) <= again.images.keys()}
+
+
+@pytest.mark.parametrize("tag", STORED)
+@pytest.mark.parametrize("orientation", ["upright", "stored"])
+def test_masks_are_of_the_pixels_that_are_read(tmp_path, tag, orientation):
+    picture, mask = np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60), np.uint8)
+    mask[:10, :20] = 255
+    expected = mask if orientation == "upright" else STORED[tag](mask)
+    for name, saved, own_tag in (
+        ("tagged.png", mask, tag),  # says itself how it is stored
+        ("alike.png", expected, 1),  # is stored as the photo is read
+        *([("other.png", STORED[tag](mask) if orientation == "upright" else mask, 1)] if tag > 4 else []),
+    ):
+        save_photo(tmp_path / "photos" / name, picture, tag)
+        save_photo(tmp_path / "masks" / f"{name}.png", saved, own_tag)
+    names = sorted(path.name for path in (tmp_path / "photos").iterdir())
+    photos = MaskedPhotos(tmp_path / "photos", names, tmp_path / "masks", orientation=orientation)
+    for name in names:
+        found = photos.read(name).mask
+        assert found is not None
+        assert np.array_equal(found, expected), name

@@ -140,7 +140,7 @@ class Colmap:
         path, camera, orientation = self.images / name, truth.camera(name), truth.info.orientation
         if (size := image_size(path, orientation)) != (camera.width, camera.height):
             raise ImageError(
-                f"{path} has {size[0]}x{size[1]} {orientation} pixels, but its camera in the model "
+                f"{path} has {size[0]}x{size[1]} pixels, but its camera in the model "
                 f"{camera.width}x{camera.height}: pass the images that the model was computed from"
             )
 

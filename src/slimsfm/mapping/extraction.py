@@ -166,7 +166,7 @@ def _redescribe_image(
             else "give the images that the model was made from"
         )
         raise ImageError(
-            f"{path}: {width}x{height} {orientation} pixels, but its camera in the model has "
+            f"{path}: {width}x{height} pixels, but its camera in the model has "
             f"{camera.width}x{camera.height}; {advice}"
         )
     keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
