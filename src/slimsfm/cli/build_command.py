@@ -38,9 +38,7 @@ def build_photos(
         names = ", ".join(made.unregistered)
         console.print(f"{len(made.unregistered)} photos could not be registered: {names}", style="yellow")
     if turned := made.info.exif_orientations:
-        console.print(
-            f"{plural(len(turned), 'photo')} turned upright by EXIF; COLMAP reads what `slimsfm export colmap` writes",
-            style="dim",
-        )
+        text = f"{plural(len(turned), 'photo')} turned upright by EXIF"
+        console.print(f"{text}; for COLMAP, `slimsfm export colmap` turns the model back", style="dim")
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} ({made.info.unit} unit)")
     finish_map(made, output, watch)
