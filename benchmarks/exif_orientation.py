@@ -138,7 +138,7 @@ def compare_cameras(pictures: Pictures, temporary: Path) -> None:
             found = center_errors(map_, alike)
             of_turned = [found[name] for name in list(pictures)[1::every] if name in found]
             medians = [f"{np.median(errors):.5f} d" for errors in (list(found.values()), of_turned)]
-            print(row.format(f"every {every}th", cameras, f"{len(map_.images)}/{len(pictures)}", *medians))
+            print(row.format(f"1 in {every}", cameras, f"{len(map_.images)}/{len(pictures)}", *medians))
 
 
 def sideways_map(pictures: Pictures, every: int, make: str, folder: Path) -> Map:
