@@ -96,7 +96,7 @@ def reprojection_errors(
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
-def resized_camera(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera:
+def resized_camera(camera: pycolmap.Camera, factor: float | int) -> pycolmap.Camera:
     """The camera of an image whose sides are multiplied by a factor."""
     resized, params = copy(camera), camera.params.copy()
     params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] *= factor

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -64,7 +64,12 @@ def read_photo(path: str | Path, orientation: Orientation = "upright", *, warn: 
 
     Raises:
         ImageError: The file is missing, not a complete image, or too large.
+        ValueError: `orientation` is not a value of `Orientation`.
     """
+    if orientation not in get_args(Orientation):
+        raise ValueError(
+            f"orientation must be one of {', '.join(get_args(Orientation))}, got {orientation!r}"
+        )
     stored = _read(path)
     if warn and stored.num_frames > 1:
         _LOGGER.warning("%s: the first of %d frames or pages is used", path, stored.num_frames)

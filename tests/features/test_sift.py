@@ -178,3 +178,17 @@ def test_frames_are_colmaps_scales_and_orientations(textured, found):
     turns = [np.abs(np.angle(np.exp(1j * (ours[1] - theirs[:, 1])))).min() for ours, theirs in pairs]
     assert np.median(ratios) == pytest.approx(1, abs=0.02)
     assert np.median(turns) < 0.1  # histograms of gradients are read out differently
+
+
+@pytest.mark.parametrize("size", [160, 320])
+def test_no_keypoint_lies_on_a_black_pixel_and_masked_ones_do_not_count(textured, size):
+    mask = np.zeros((240, 320), np.uint8)
+    mask[60:180, 100:250] = np.random.default_rng(0).random((120, 150)) > 0.1
+    whole = Sift(max_image_size=size).extract(textured)
+    inside = Sift(max_image_size=size).extract(textured, mask)
+    columns, rows = inside.keypoints.astype(int).T
+    assert (mask[rows, columns] > 0).all()
+    count = len(inside) // 2
+    strongest = Sift(max_image_size=size, max_features=count).extract(textured, mask)
+    assert len(strongest) == count < len(whole) / 4
+    assert np.array_equal(strongest.keypoints, inside.keypoints[:count])

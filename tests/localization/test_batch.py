@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -108,3 +109,31 @@ def test_gravity_is_read_by_image_name(tmp_path):
         path.write_text(text)
         with pytest.raises(InputError, match=r"gravity\.json: should hold"):
             read_gravity(path)
+
+
+def test_transparent_pixels_of_queries_hold_no_features(boulder, tmp_path):
+    path = boulder.query.image_paths[0]
+    image = read_image(path)
+    half = image.shape[1] // 2
+    alpha = np.full(image.shape[:2], 255, np.uint8)
+    alpha[:, :half] = 0
+    PillowImage.fromarray(np.dstack([image, alpha])).save(tmp_path / "a.png")
+    localizer = Localizer(boulder.map, LocalizationOptions(min_confidence=0.0))
+    (found,) = localize_images(localizer, tmp_path).values()
+    assert found.num_matches > 0
+    assert found.points2D[:, 0].min() >= half
+    assert_same_outcomes({"a": found}, {"a": localizer.localize(image, mask=alpha)})
+
+
+def test_images_that_are_skipped_are_said(boulder, tmp_path, caplog):
+    shutil.copy(boulder.query.image_paths[0], tmp_path / "a.png")
+    (tmp_path / "b.nef").write_bytes(b"")
+    assert list(localize_images(Localizer(boulder.map), tmp_path)) == ["a.png"]
+    assert "1 raw file skipped: b.nef" in caplog.text
+
+
+def test_an_image_whose_name_cannot_be_listed_is_refused_alone_too(boulder, tmp_path):
+    path = tmp_path / "a\nb.png"
+    shutil.copy(boulder.query.image_paths[0], path)
+    with pytest.raises(InputError, match="line break"):
+        localize_images(Localizer(boulder.map), path)

@@ -150,3 +150,18 @@ def test_equal_results_give_equal_bytes(results, tmp_path, name):
     first = (tmp_path / name).read_bytes()
     write_poses(tmp_path / name, results, overwrite=True)
     assert (tmp_path / name).read_bytes() == first
+
+
+@pytest.mark.parametrize("name", ["my query.png", "a\tb.png", "a\nb.png", " a.png"])
+def test_names_that_colmap_would_cut_off_are_refused_and_the_other_formats_hold_them(results, tmp_path, name):
+    named = {name: next(iter(results.values()))}
+    with pytest.raises(
+        OutputError, match=r"images\.txt cannot hold a name with spaces, .* write \.json or \.csv"
+    ):
+        write_poses(tmp_path / "images.txt", named)
+    assert list(tmp_path.iterdir()) == []
+    for file in ("poses.json", "poses.csv", "poses.txt"):
+        write_poses(tmp_path / file, named)
+    assert [one["name"] for one in json.loads((tmp_path / "poses.json").read_text())["images"]] == [name]
+    with (tmp_path / "poses.csv").open(newline="", encoding="utf-8") as table:
+        assert [row["name"] for row in csv.DictReader(table)] == [name]

@@ -270,6 +270,12 @@ def test_a_reduced_map_needs_no_features_of_dropped_images(exact, tmp_path):
         assert list(file) == ["002.png"]
 
 
+def test_names_with_line_breaks_are_refused(exact, tmp_path):
+    with pytest.raises(InputError, match=r"'a\\nb\.png': a list with a name per line cannot hold it"):
+        write_hloc(renamed(exact, ["a\nb.png", *list(exact.images)[1:]]), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_names_of_queries_are_read_from_folders_and_lists(tmp_path):
     folder = tmp_path / "queries"
     (folder / "night").mkdir(parents=True)

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from inspect import unwrap
 from itertools import cycle
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 from commands import slimsfm
 from exif_photos import MIRRORED, STORED, save_photo
 from slimsfm.cli.output import quiet
-from slimsfm.errors import ImageError, MapError
+from slimsfm.errors import ImageError, InputError, MapError
 from slimsfm.geometry import rotation_error_deg
 from slimsfm.localization import Localizer, MultiLocalizer, localize_images, localize_objects
 from slimsfm.mapping.build import BuildOptions, build_map
@@ -23,7 +24,7 @@ from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.masked_photos import MaskedPhotos
 from slimsfm.mapping.orientation import stored_model, turned_pose
-from slimsfm.photos import read_image
+from slimsfm.photos import read_image, read_photo
 from slimsfm.synthetic.scene import mapping_take
 
 ROTATED = (1, 3, 6, 8)
@@ -245,3 +246,16 @@ def test_masks_are_of_the_pixels_that_are_read(tmp_path, tag, orientation):
         found = photos.read(name).mask
         assert found is not None
         assert np.array_equal(found, expected), name
+
+
+def test_another_orientation_is_refused():
+    with pytest.raises(ValueError, match="orientation must be one of upright, stored, got 'sideways'"):
+        unwrap(read_photo)("a.png", "sideways")
+
+
+def test_without_a_detector_pictures_held_both_ways_cannot_be_told_to_share_a_camera(tmp_path, textured):
+    for i in range(3):
+        save_photo(tmp_path / f"{i}.png", textured.swapaxes(0, 1) if i == 1 else textured)
+    options = BuildOptions(extractor="loftr", camera="shared")
+    with pytest.raises(InputError, match=r"1\.png: width and height are swapped.*camera='auto'"):
+        build_map(tmp_path, options)

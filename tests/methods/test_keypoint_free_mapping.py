@@ -165,11 +165,6 @@ def test_building_twice_gives_the_same(scene, built, tmp_path):
     ]
 
 
-def test_masks_are_read_from_a_folder_that_must_exist(scene, tmp_path):
-    with pytest.raises(InputError, match="no such folder of masks"):
-        scene.build(tmp_path, masks=tmp_path / "masks")
-
-
 def test_references_are_one_a_point_and_in_few_images(built):
     tracks = read_tracks(built.model)
     is_reference = choose_references(tracks)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, get_args, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import pycolmap
 
@@ -81,8 +81,6 @@ class BuildOptions:
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        if self.alpha not in get_args(AlphaUse):
-            raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaUse))}, got {self.alpha!r}")
 
 
 @dataclass(frozen=True, kw_only=True)

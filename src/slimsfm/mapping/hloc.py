@@ -40,7 +40,8 @@ def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overw
 
     Raises:
         MapError: The map is for direct matching only.
-        InputError: A query has the name of an image of the map, or a name in a pair contains a space.
+        InputError: A query has the name of an image of the map, a name in a pair has a space, or a name has a
+            line break.
         OutputError: The folder exists and `overwrite` is off, or it cannot be written.
     """
     if map.is_for_direct_matching:
@@ -127,4 +128,7 @@ def _as_in_hloc(features: Features) -> Features:
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:
+    lines = list(lines)
+    if broken := [line for line in lines if line.splitlines() != [line]]:
+        raise InputError(f"{broken[0]!r}: a list with a name per line cannot hold it; rename the image")
     path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

@@ -10,7 +10,7 @@ features either, unless they are told to.
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal, get_args
+from typing import Literal
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, InputError
@@ -64,10 +64,7 @@ class MaskedPhotos:
 
         Raises:
             InputError: The folder of masks does not exist or holds no mask of these photos.
-            ValueError: `alpha` is not a value of `AlphaUse`.
         """
-        if alpha not in get_args(AlphaUse):
-            raise ValueError(f"alpha must be one of {', '.join(get_args(AlphaUse))}, got {alpha!r}")
         self._folder, self._names, self._alpha = folder, names, alpha
         self._orientation: Orientation = orientation
         self._masks: dict[str, Path] = {}
