@@ -129,6 +129,19 @@ def test_a_model_of_stored_or_untagged_pictures_is_not_touched(exact: Map) -> No
     assert stored_model(with_tags(stored, 6, 2)) is exact.model
 
 
+def test_images_without_a_pose_do_not_matter(exact: Map) -> None:
+    model = pycolmap.Reconstruction(exact.model)
+    image = pycolmap.Image(name="unposed.png", camera_id=1, image_id=99)
+    frame = pycolmap.Frame(frame_id=99, rig_id=1)
+    frame.add_data_id(image.data_id)
+    model.add_frame(frame)
+    image.frame_id = 99
+    model.add_image(image)
+    unposed = replace(exact, model=model)
+    assert stored_model(unposed) is model
+    assert stored_model(with_tags(unposed, 6)).num_images() == len(exact.images)
+
+
 @pytest.mark.parametrize("tag", [2, 4, 5, 7])
 def test_mirrored_images_are_left_out_and_named(exact: Map, tag: int) -> None:
     map_ = with_tags(exact, tag, 1, 6)
@@ -153,5 +166,13 @@ def test_images_of_a_rig_of_several_cameras_are_not_turned_one_by_one() -> None:
         else:
             rig.add_sensor(one.sensor_id, pycolmap.Rigid3d())
     model.add_rig(rig)
+    cam = pycolmap.Image(name="a", camera_id=1, image_id=1)
+    frame = pycolmap.Frame(frame_id=1, rig_id=1)
+    frame.add_data_id(cam.data_id)
+    frame.rig_from_world = pycolmap.Rigid3d()
+    model.add_frame(frame)
+    cam.frame_id = 1
+    model.add_image(cam)
+    model.register_frame(1)
     with pytest.raises(ModelError, match="rigs of several cameras"):
         turned_model(model, {"a": 1})

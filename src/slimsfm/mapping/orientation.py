@@ -134,11 +134,12 @@ def turned_model(model: pycolmap.Reconstruction, turns: Mapping[str, int]) -> py
     Raises:
         ModelError: A camera cannot be turned, or several cameras belong to one rig.
     """
-    if not any(turns.values()) and all(image.name in turns for image in model.images.values()):
+    posed = [model.image(image_id) for image_id in model.reg_image_ids()]
+    if not any(turns.values()) and all(image.name in turns for image in posed):
         return model
     if any(rig.num_sensors() > 1 for rig in model.rigs.values()):
         raise ModelError("the model has rigs of several cameras, whose images cannot be turned one by one")
-    kept = [image for i in model.reg_image_ids() if (image := model.image(i)).name in turns]
+    kept = [image for image in posed if image.name in turns]
     made = pycolmap.Reconstruction()
     camera_ids = _add_cameras(made, model, kept, turns)
     for image in sorted(kept, key=lambda one: one.image_id):
