@@ -64,8 +64,8 @@ def localize(
         raise InputError(f"workers must be at least 1, got {workers}")
     if gravity and (also or localization.focal != "known"):
         raise InputError("gravity goes with one map and a known focal length; leave out also or focal")
-    check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
     localizers = {name: Localizer(read_map(path), localization) for name, path in _named(map, *also).items()}
+    check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
     given = read_camera(camera) if camera else None
     if also:
         multi = MultiLocalizer(localizers)
