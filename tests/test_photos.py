@@ -101,7 +101,15 @@ def test_every_kind_of_transparency_is_read_and_opaque_images_have_none(tmp_path
     photo = read_photo(tmp_path / "a.png")
     assert photo.image[0, 0].tolist() == [100] * 3
     assert np.array_equal(alpha if photo.alpha is None else photo.alpha, alpha)
-    assert (photo.alpha is None) == (not hole)
+    assert (photo.alpha is None) == (photo.visible is None) == (not hole)
+
+
+def test_what_is_transparent_everywhere_is_visible_everywhere_to_a_query(tmp_path):
+    Image.new("RGBA", (5, 4)).save(tmp_path / "a.png")
+    photo = read_photo(tmp_path / "a.png")
+    assert photo.alpha is not None
+    assert not photo.alpha.any()
+    assert photo.visible is None
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])

@@ -53,6 +53,11 @@ class Photo:
     num_frames: int
     """Number of frames or pages in the file, of which this is the first."""
 
+    @property
+    def visible(self) -> GrayImage | None:
+        """The mask of a query: `alpha`, unless nothing would be left."""
+        return self.alpha if self.alpha is not None and self.alpha.any() else None
+
 
 def read_photo(path: str | Path, orientation: Orientation = "upright", *, warn: bool = True) -> Photo:
     """Read an image of any format, color mode and bit depth.
@@ -170,7 +175,7 @@ class _Stored(NamedTuple):
 
 
 def _read(path: str | Path) -> _Stored:
-    with opened(path) as file:
+    with opened_image(path) as file:
         is_deep = _is_deep(file)  # first, because Pillow forgets the depth when it decodes
         orientation = exif_orientation(file)
         values, alpha = _deep_values(file, path) if is_deep else None, None
@@ -240,8 +245,8 @@ def _as_bytes(values: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[PillowImage.Image]:
-    """Open an image file.
+def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
+    """Open an image file by Pillow, HEIC included.
 
     Raises:
         ImageError: As in `read_photo`, here or within the context.

@@ -17,7 +17,7 @@ from PIL import Image as PilImage
 
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import stored_size
-from slimsfm.photos import Orientation, exif_orientation
+from slimsfm.photos import Orientation, exif_orientation, opened_image
 
 PIXEL_CENTER = 0.5
 """Both coordinates of the center of the top-left pixel in COLMAP's convention."""
@@ -204,7 +204,7 @@ def image_size(path: Path, orientation: Orientation = "upright") -> tuple[int, i
         ImageError: The file is missing or not an image.
     """
     try:
-        with PilImage.open(path) as image:
+        with opened_image(path) as image:
             if image.format == "PNG" and "exif" not in image.info:
                 return image.size  # EXIF after the pixels would require decoding them
             width, height = stored_size(image)

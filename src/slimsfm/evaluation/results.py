@@ -367,7 +367,7 @@ def prepare_queries(
     for query in progress(queries, "extract query features"):
         photo = read_photo(query.path, query.orientation)
         start = perf_counter()
-        features = extractor.extract(photo.image, photo.alpha)
+        features = extractor.extract(photo.image, photo.visible)
         seconds = perf_counter() - start
         prepared.append(PreparedQuery(query=query, features=features, extract_seconds=seconds))
     return prepared

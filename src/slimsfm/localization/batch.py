@@ -88,7 +88,8 @@ def localize_images(
 ) -> dict[str, Localization]:
     """Localize the images of a folder.
 
-    Results do not depend on the number of workers. Transparent pixels of an image hold no features.
+    Results do not depend on the number of workers. Transparent pixels of an image hold no features,
+    unless all are.
 
     Args:
         localizer: Localizer of the map.
@@ -184,5 +185,5 @@ def _localize_one(
         if alike:
             photo = read_photo(task.path, orientation)
             multi, down = MultiLocalizer(alike), gravity.get(task.name)
-            found |= multi.localize(photo.image, task.cameras, down, photo.alpha)
+            found |= multi.localize(photo.image, task.cameras, down, photo.visible)
     return {key: found[key] for key in localizer.localizers}

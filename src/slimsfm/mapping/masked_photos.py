@@ -99,7 +99,8 @@ class MaskedPhotos:
         if len(self._names) - len(empty) < 2 <= len(self._names):
             raise InputError(
                 f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask "
-                "they are white, or have any other value but 0, and in a photo they are not transparent"
+                "they are white, or have any other value but 0, and in a photo they are not transparent; "
+                "`alpha='ignore'` ignores transparency"
             )
 
     @property
