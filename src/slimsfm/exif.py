@@ -14,7 +14,7 @@ from PIL import ExifTags
 from PIL import Image as PillowImage
 
 from slimsfm.image_files import named
-from slimsfm.photos import Orientation, exif_of, exif_orientation, opened_image
+from slimsfm.photos import Orientation, exif_of, exif_orientation, opened_image, reading
 
 _SMALLEST_FIELD_DEG, _LARGEST_FIELD_DEG = 5.0, 150.0  # of view, along the longer side
 _GUESS = 1.2  # focal length over the longer side, as in COLMAP
@@ -68,7 +68,7 @@ def read_exif(path: str | Path) -> Exif:
     Raises:
         ImageError: The file is missing or not an image.
     """
-    with opened_image(path) as file:
+    with reading(path), opened_image(path) as file:
         exif, size, tag = exif_of(file), stored_size(file), exif_orientation(file)
     found = {name: exif[key] for name, key in _FOCAL_LENGTHS.items() if key in exif}
     focal = _inferred_focal(path)
@@ -138,7 +138,7 @@ def read_orientation(path: str | Path) -> int:
     Raises:
         ImageError: The file is missing or not an image.
     """
-    with opened_image(path) as file:
+    with reading(path), opened_image(path) as file:
         return exif_orientation(file)
 
 

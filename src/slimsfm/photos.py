@@ -175,7 +175,7 @@ class _Stored(NamedTuple):
 
 
 def _read(path: str | Path) -> _Stored:
-    with opened_image(path) as file:
+    with reading(path), opened_image(path) as file:
         is_deep = _is_deep(file)  # first, because Pillow forgets the depth when it decodes
         orientation = exif_orientation(file)
         values, alpha = _deep_values(file, path) if is_deep else None, None
@@ -249,10 +249,9 @@ def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
     """Open an image file by Pillow, HEIC included.
 
     Raises:
-        ImageError: As in `read_photo`, here or within the context.
+        ImageError: It is a HEIC photo, and the package for them is missing.
     """
-    # given a path, Pillow maps TIFF into memory and mixes up turned ones
-    with _reading(path), Path(path).open("rb") as raw:
+    with Path(path).open("rb") as raw:  # given a path, Pillow maps TIFF into memory and mixes up turned ones
         head = raw.read(12)
         if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
             raise ImageError(f"{path}: {INSTALL_HEIC}")
@@ -275,7 +274,8 @@ def _register_heic() -> bool:
 
 
 @contextmanager
-def _reading(path: str | Path) -> Iterator[None]:
+def reading(path: str | Path) -> Iterator[None]:
+    """Report a file that cannot be read as an image as an `ImageError` that says what to do."""
     try:
         yield
     except FileNotFoundError as error:
