@@ -1,6 +1,7 @@
 """`slimsfm info`."""
 
 import json as json_format
+from dataclasses import asdict
 
 from slimsfm.cli.options import MapPath
 from slimsfm.cli.output import console, counts, plural, print_notes, size
@@ -46,6 +47,7 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         "exif_orientations": {
             name: tag for name, tag in map.info.exif_orientations.items() if name in map.images
         },
+        "quality": asdict(map.info.quality) if map.info.quality else None,
         "bytes": sizes,
     }
 
@@ -63,10 +65,12 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
     matches = f", {plural(len(map.matches), 'verified pair')}" if map.matches else ""
     options = ", ".join(f"{key} {value}" for key, value in info.extractor_options.items())
     unit = "map units (unknown scale)" if info.unit == "unknown" else info.unit
+    support = {"support": map.info.quality.summary} if map.info.quality else {}
     return {
         "map": map.describe(),
         "images": f"{len(map.images)}{matches}",
         "points": points,
+        **support,
         "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
         "extractor": info.extractor + (f" ({options})" if options else ""),
         "pixels": _pixels(map),

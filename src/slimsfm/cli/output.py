@@ -9,6 +9,7 @@ from typing import Any
 import pycolmap
 from rich.console import Console
 
+from slimsfm.cli.parsing import with_flags
 from slimsfm.errors import OutputError
 from slimsfm.files import check_writable
 from slimsfm.mapping.map import Map
@@ -89,9 +90,11 @@ def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:
 
 
 def print_notes(map: Map) -> None:
-    """Print what was skipped, ignored or guessed when a map was made."""
+    """Print what was skipped, ignored or guessed when a map was made, and what contradicts it."""
     for note in map.info.notes:
-        console.print(f"note: {note}", style="yellow", markup=False)
+        console.print(f"note: {with_flags(note)}", style="yellow", markup=False)
+    for doubt in map.info.quality.doubts if map.info.quality else ():
+        console.print(f"warning: {doubt}", style="bold red", markup=False)
 
 
 def finish_map(made: Map, output: Path, watch: Stopwatch) -> None:

@@ -15,6 +15,9 @@ good for a wrong pose:
 Their weighted sum is the log-odds that the pose is right. The weights come from logistic regression on
 rendered and photographed scenes, some of them built to deceive; signs are constrained to the plausible ones.
 `benchmarks/confidence.py` learns the weights and measures the calibration on held-out scenes.
+
+This holds on right maps. Next to images that the map's own matches contradict, because the map may be folded
+there, 60 % of the confidence remains.
 """
 
 from dataclasses import dataclass
@@ -38,6 +41,8 @@ RIVAL_RANSAC = RansacOptions(min_inliers=6, max_iterations=150)
 UNAMBIGUOUS = 0.75
 """Share of distinct inliers from which a pose is unambiguous."""
 
+_DOUBTED = 0.6  # of the confidence, next to contradicted images
+_NEAREST = 3  # images that are next to a pose
 _CHECKED = 100  # visible points to look for
 _STRONGEST = 2048  # keypoints to look among
 _NEAR_PX, _FAR_PX = 5.0, 15.0  # distance from the projection of a point: at most there, at least elsewhere
@@ -66,10 +71,14 @@ class Evidence:
     found: float
     """Share of the points that should be visible that are found where they project and nowhere else."""
 
+    doubted: bool = False
+    """Whether matches contradict the poses of the reference images next to the pose."""
+
     @property
     def confidence(self) -> float:
         """Probability that the pose is right."""
-        return float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
+        on_right_map = float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
+        return on_right_map * (_DOUBTED if self.doubted else 1.0)
 
     @property
     def is_ambiguous(self) -> bool:
@@ -108,6 +117,8 @@ class Verifier:
         self._strategy = strategy
         self._alike = map.descriptor_metric.max_distance
         self._distinct = distinct
+        self._doubtful = _doubtful_images(map)
+        self._centers = np.array([image.projection_center() for image in map.images.values()])
 
     def evidence(
         self, query: Query, matches: PointMatches, pose: PoseEstimate, camera: pycolmap.Camera
@@ -129,7 +140,13 @@ class Verifier:
             predicted_error=pose.predicted_corner_error(self._box),
             rival=self._rival(matches, matches.pixels(query), others, pose, camera),
             found=self._found(query, points, pose, camera),
+            doubted=self._doubted(pose),
         )
+
+    def _doubted(self, pose: PoseEstimate) -> bool:
+        center = pose.cam_from_world.inverse().translation
+        nearest = np.argsort(np.linalg.norm(self._centers - center, axis=1), kind="stable")[:_NEAREST]
+        return bool(self._doubtful[nearest].any())
 
     def _rival(
         self,
@@ -157,6 +174,12 @@ class Verifier:
             return 0.0
         visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
         return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
+
+
+def _doubtful_images(map: Map) -> Mask:
+    """Which reference images, in order of name, see what contradicted images see."""
+    doubtful = map.info.quality.doubtful if map.info.quality else ()
+    return np.array([name in doubtful for name in map.images], bool)
 
 
 def _count(keypoints: Ids) -> int:

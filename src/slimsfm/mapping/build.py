@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -15,22 +15,25 @@ from slimsfm.exif import Exif, ignored_values, read_exif, read_orientation
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
 from slimsfm.geometry import Box
 from slimsfm.mapping.descriptors import with_global_descriptors
+from slimsfm.mapping.diagnosis import diagnose
 from slimsfm.mapping.extraction import CameraSharing, color_points, extract_features, guess_cameras
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos, find_photos
 from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
+from slimsfm.mapping.quality import ModelQuality
+from slimsfm.mapping.reconstruction import pick_model, reconstruct
 from slimsfm.mapping.sfm import (
     colmap_warnings,
     match_pairs,
     put_keypoints,
-    reconstruct,
     triangulate,
     verified_matches,
     write_database,
 )
 from slimsfm.mapping.shrinking import ShrunkImages
+from slimsfm.mapping.support import measure
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
@@ -75,12 +78,17 @@ class BuildOptions:
     box: Path | None = None
     """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
 
+    model: int = 1
+    """Which model to keep if the photos give several: 1 is the largest."""
+
     seed: int = 0
     """Seed of every random choice."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
+        if self.model < 1:
+            raise ValueError(f"model must be at least 1, got {self.model}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,6 +168,7 @@ def build_map(
                 parts = _parts_with_keypoints(work, extractor, options)
         except ReconstructionError as error:  # what was skipped may be the reason
             raise ReconstructionError("; ".join([str(error), *notes, *photos.notes])) from error
+    quality = measure(parts.model, parts.matches, names)
     info = MapInfo(
         extractor=parts.extractor.name,
         extractor_options=parts.extractor.options,
@@ -167,7 +176,8 @@ def build_map(
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
-        notes=(*notes, *photos.notes),
+        quality=replace(quality, focal_origins=_origins(quality, work.cameras, known)),
+        notes=(*notes, *photos.notes, *parts.notes),
         orientation=options.orientation,
         exif_orientations=_exif_orientations(work, exifs) if options.orientation == "upright" else {},
     )
@@ -189,6 +199,16 @@ def _exif_orientations(work: "BuildWork", exifs: Mapping[str, Exif]) -> dict[str
         for name in work.names
     }
     return {name: tag for name, tag in tags.items() if tag != 1}
+
+
+def _origins(
+    quality: ModelQuality, cameras: Mapping[str, pycolmap.Camera], known: KnownPoses | None
+) -> dict[str, str]:
+    if known:
+        return dict.fromkeys(quality.focal_lengths, "given")
+    return {
+        name: "EXIF" if cameras[name].has_prior_focal_length else "guessed" for name in quality.focal_lengths
+    }
 
 
 @contextmanager
@@ -247,6 +267,9 @@ class MapParts:
     matches: Matches
     """Verified matches by pair of image names."""
 
+    notes: tuple[str, ...] = ()
+    """What the user should know about the choice of the model."""
+
     photos: Mapping[str, Image] = field(default_factory=dict)
     """Small photos by image name, for extractors without keypoints."""
 
@@ -272,19 +295,28 @@ def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildO
     shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
     database, sfm = _match(work, features, shrunk, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
+    notes: tuple[str, ...] = ()
     if work.known:
         poses = work.known.cam_from_world
         model = triangulate(database, names, sfm, poses, seed=seed, progress=progress)
     else:
-        model = reconstruct(database, names, sfm, seed=seed, progress=progress)
+        try:
+            models = reconstruct(database, names, sfm, seed=seed, progress=progress)
+        except ReconstructionError as error:
+            matches = verified_matches(database, dict(enumerate(names, start=1)))
+            reasons = [str(error), diagnose(work.images, names, shrunk.features, matches)]
+            raise ReconstructionError(
+                f"{work.images}: these {len(names)} photos give no model: {'; '.join(filter(None, reasons))}"
+            ) from error
+        model, notes = pick_model(models, options.model)
+    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=work.known is not None)
     if work.turned:
         turns_back = {image.name: -int(image.name in work.turned) for image in model.images.values()}
         model = turned_model(model, turns_back)
         put_keypoints(model, features)
     color_points(model, colors)
-    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
-    return MapParts(extractor=extractor, model=model, features=features, matches=matches)
+    return MapParts(extractor=extractor, model=model, features=features, matches=matches, notes=notes)
 
 
 def _extractor(options: BuildOptions) -> Extractor:

@@ -18,6 +18,7 @@ from slimsfm.mapping.extraction import redescribe
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, estimate_box, read_box, read_model
 from slimsfm.mapping.sfm import colmap_warnings, verified_matches
+from slimsfm.mapping.support import measure
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
@@ -112,6 +113,10 @@ def import_colmap(
         orientation=options.orientation,
         exif_orientations=_tags(model, options),
     )
+    if source.matches:
+        quality = measure(model, source.matches, [image.name for image in model.images.values()])
+        origins = dict.fromkeys(quality.focal_lengths, "model")
+        info = replace(info, quality=replace(quality, focal_origins=origins))
     made = Map(model=model, features=source.features, matches=source.matches, info=info)
     return with_global_descriptors(made)
 

@@ -13,8 +13,9 @@ MAP/
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import cv2
 import h5py
@@ -42,6 +43,7 @@ from slimsfm.mapping.descriptors import (
 )
 from slimsfm.mapping.map import Map, MapInfo, check_map, check_num_features
 from slimsfm.mapping.model import read_model
+from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation, shrink
 
 _QUALITY = 95
@@ -216,7 +218,15 @@ def _info_to_json(map: Map) -> dict:
         "notes": list(info.notes),
         "orientation": info.orientation,
         **({"exif_orientations": tags} if tags else {}),
+        "quality": None if info.quality is None else asdict(info.quality),
     }
+
+
+def _quality(data: dict[str, Any] | None) -> ModelQuality | None:
+    if data is None:
+        return None
+    lists = {key: tuple(data[key]) for key in ("doubtful", "pieces")}
+    return ModelQuality(**{**data, **lists})
 
 
 def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
@@ -247,7 +257,8 @@ def _read_info(path: Path) -> MapInfo:
             box_source=data["box"]["source"],
             unit=data["unit"],
             origin=data["origin"],
-            notes=tuple(data.get("notes", ())),
+            notes=tuple(map(str, data.get("notes", ()))),
+            quality=_quality(data.get("quality")),
             orientation=_orientation(data.get("orientation", "upright")),
             exif_orientations={
                 str(name): int(tag) for name, tag in data.get("exif_orientations", {}).items()

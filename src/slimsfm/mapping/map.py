@@ -16,6 +16,7 @@ from slimsfm.errors import MapError
 from slimsfm.features import Features, NearestOptions, shrink_factor
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
+from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation
 
 MapKind = Literal["full", "images", "points", "images and points"]
@@ -42,6 +43,9 @@ class MapInfo:
 
     origin: str
     """A sentence that says how the map was made."""
+
+    quality: ModelQuality | None = None
+    """What supports the full model, and what contradicts it. None without verified matches."""
 
     notes: tuple[str, ...] = ()
     """Sentences, with names, on what was skipped, ignored or guessed when the map was made."""

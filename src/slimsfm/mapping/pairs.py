@@ -61,7 +61,7 @@ def sequential_pairs(names: Iterable[str], *, overlap: int = 10) -> Pairs:
 
     Meant for the frames of a video. Numbers in names count as numbers: frame2 comes before frame10.
     """
-    ordered = sorted(names, key=_natural)
+    ordered = in_order(names)
     steps = [*range(1, overlap + 1), *(overlap + 2**i for i in range(1, overlap.bit_length() + 1))]
     found = (tuple(sorted((ordered[i], ordered[i + k]))) for k in steps for i in range(len(ordered) - k))
     return sorted({(a, b) for a, b in found})
@@ -74,6 +74,11 @@ def similar_pairs(names: list[str], descriptors: Float32[np.ndarray, "n d"], *, 
     nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(k, len(names) - 1)]
     found = (tuple(sorted((names[i], names[j]))) for i in range(len(names)) for j in nearest[i])
     return sorted({(a, b) for a, b in found})
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Sort names so that numbers in them count as numbers: frame2 comes before frame10."""
+    return sorted(names, key=_natural)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

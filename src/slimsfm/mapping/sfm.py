@@ -4,7 +4,7 @@ import logging
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,8 +23,10 @@ _JITTER_PX, _ON_GRID = 0.05, 1e-3  # pixels
 _BLOCK = 200  # pairs that COLMAP matches per call
 
 # COLMAP cannot read the photos, because its database names them by numbers; we color points ourselves. After
-# a good model it tries others, of the few remaining images.
-_EXPECTED_WARNINGS = re.compile(r"Could not read image|Requested to use GPU|Discarding reconstruction")
+# a good model it tries others, of the few remaining images. Focal lengths are often unknown.
+_EXPECTED_WARNINGS = re.compile(
+    r"Could not read image|Requested to use GPU|Discarding reconstruction|Less than 50% of cameras have prior"
+)
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -65,18 +67,9 @@ def write_database(
     """
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for camera_id, camera in sorted({c.camera_id: c for c in cameras.values()}.items()):
-            database.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=camera_id)
-            rig.add_ref_sensor(camera.sensor_id)
-            database.write_rig(rig, use_rig_id=True)
+        _write_cameras(database, cameras.values())
         for image_id, name in enumerate(sorted(features), start=1):
-            camera_id = cameras[name].camera_id
-            image = pycolmap.Image(name=str(image_id), camera_id=camera_id, image_id=image_id)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
+            _write_image(database, image_id, str(image_id), cameras[name].camera_id)
             _write_features(database, image_id, features[name])
 
 
@@ -87,6 +80,55 @@ def _write_features(database: pycolmap.Database, image_id: int, features: Featur
             type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors
         )
         database.write_descriptors(image_id, descriptors)
+
+
+def copy_verified(
+    source: Path,
+    target: Path,
+    *,
+    pairs: Container[tuple[int, int]] | None = None,
+    cameras: Mapping[int, pycolmap.Camera] | None = None,
+) -> None:
+    """Copy what mapping needs of a database: cameras, images, keypoints and verified matches.
+
+    Args:
+        source: The database.
+        target: The copy; an existing file is replaced.
+        pairs: Pairs of image ids whose matches are copied. Default: all.
+        cameras: Cameras by image id, instead of those of the database.
+    """
+    target.unlink(missing_ok=True)
+    with (
+        pycolmap.Database.open(source) as old,
+        pycolmap.Database.open(target) as new,
+        pycolmap.DatabaseTransaction(new),
+    ):
+        images = {image.image_id: image for image in old.read_all_images()}
+        used = cameras or {i: old.read_camera(image.camera_id) for i, image in images.items()}
+        _write_cameras(new, used.values())
+        for image_id, image in images.items():
+            _write_image(new, image_id, image.name, used[image_id].camera_id)
+            new.write_keypoints(image_id, old.read_keypoints(image_id))
+        for pair_id, geometry in zip(*old.read_two_view_geometries(), strict=True):
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            if pairs is None or (a, b) in pairs:
+                new.write_two_view_geometry(a, b, geometry)
+
+
+def _write_cameras(database: pycolmap.Database, cameras: Iterable[pycolmap.Camera]) -> None:
+    for camera_id, camera in sorted({camera.camera_id: camera for camera in cameras}.items()):
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=camera_id)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+
+
+def _write_image(database: pycolmap.Database, image_id: int, name: str, camera_id: int) -> None:
+    image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+    database.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
 
 
 def _off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
@@ -152,43 +194,33 @@ def verified_matches(database: Path, names: Mapping[int, str]) -> dict[tuple[str
         return {key: found[key][np.argsort(found[key][:, 0], kind="stable")] for key in sorted(found)}
 
 
-def reconstruct(
-    database: Path, names: list[str], workspace: Path, *, seed: int, progress: ProgressBar = silent
-) -> pycolmap.Reconstruction:
-    """Reconstruct the images of a database; returns the largest model.
-
-    Runs incremental mapping [1]. If this registers fewer than 90 % of the images (a walk along a street has
-    no good initial pair), global mapping [2] runs as well, and the larger model is returned.
-
-    Raises:
-        ReconstructionError: No two images could be joined to a model.
-
-    References:
-        [1] Schoenberger and Frahm, Structure-from-Motion Revisited, CVPR 2016.
-        [2] Pan, Barath, Pollefeys and Schoenberger, Global Structure-from-Motion Revisited, ECCV 2024.
-    """
-    workspace.mkdir(parents=True, exist_ok=True)
-    models = _map_incrementally(database, workspace, seed, len(names), progress)
-    if max((model.num_reg_images() for model in models), default=0) < 0.9 * len(names):
-        with single_step(progress, "reconstruct globally"):
-            models += _map_globally(database, workspace, seed)
-    if not models:
-        raise ReconstructionError(
-            f"no model could be reconstructed from these {len(names)} images; take more images, with more "
-            "overlap, or of an object with more texture"
-        )
-    model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    _name_images(model, names)
-    return model
-
-
 # Mapping runs on one thread, also in the libraries below: with more, equal input gives unequal models, and
 # mapping is hardly faster.
 
 
-def _map_incrementally(
-    database: Path, workspace: Path, seed: int, num_images: int, progress: ProgressBar
+def map_incrementally(
+    database: Path,
+    names: list[str],
+    *,
+    seed: int,
+    progress: ProgressBar = silent,
+    start: pycolmap.Reconstruction | None = None,
 ) -> list[pycolmap.Reconstruction]:
+    """Reconstruct the images of a database by incremental mapping [1].
+
+    Args:
+        database: Images, features and verified matches.
+        names: Names of the images, which the database numbers from 1.
+        seed: Seed of every random choice.
+        progress: Progress callback.
+        start: A model to extend, of the same images and cameras. By default, mapping starts anew.
+
+    Returns:
+        The models, which may share images; with a start, the extended model alone.
+
+    References:
+        [1] Schoenberger and Frahm, Structure-from-Motion Revisited, CVPR 2016.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -207,25 +239,58 @@ def _map_incrementally(
         registered += 1
         advance_to(registered)
 
-    with threadpool_limits(1), counted(progress, num_images, "register images") as advance_to:
+    with (
+        threadpool_limits(1),
+        counted(progress, len(names), "register images") as advance_to,
+        _scratch() as folder,
+    ):
+        if start is not None:
+            _numbered(start).write(folder)
+            options.multiple_models = False
         models = pycolmap.incremental_mapping(
             database,
-            workspace,
-            workspace,
+            folder,
+            folder,
+            input_path=folder if start is not None else "",
             options=options,
             initial_image_pair_callback=start_model,
             next_image_callback=add_image,
         )
-    return list(models.values())
+    return _named(models, names)
 
 
-def _map_globally(database: Path, workspace: Path, seed: int) -> list[pycolmap.Reconstruction]:
+def map_globally(database: Path, names: list[str], *, seed: int) -> list[pycolmap.Reconstruction]:
+    """Reconstruct the images of a database by global mapping [1].
+
+    References:
+        [1] Pan, Barath, Pollefeys and Schoenberger, Global Structure-from-Motion Revisited, ECCV 2024.
+    """
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = 1
     options.random_seed = seed
     pycolmap.set_random_seed(seed)
-    with threadpool_limits(1):
-        return list(pycolmap.global_mapping(database, workspace, workspace, options=options).values())
+    with threadpool_limits(1), _scratch() as folder:
+        return _named(pycolmap.global_mapping(database, folder, folder, options=options), names)
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="slimsfm-sfm-") as folder:
+        yield Path(folder)
+
+
+def _named(models: Mapping[int, pycolmap.Reconstruction], names: list[str]) -> list[pycolmap.Reconstruction]:
+    for model in models.values():
+        _name_images(model, names)
+    return [model for _, model in sorted(models.items())]
+
+
+def _numbered(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy with the names that images have in the database."""
+    copy = pycolmap.Reconstruction(model)
+    for image_id, image in copy.images.items():
+        image.name = str(image_id)
+    return copy
 
 
 def _name_images(model: pycolmap.Reconstruction, names: list[str]) -> None:

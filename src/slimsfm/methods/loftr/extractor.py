@@ -190,6 +190,7 @@ class DetectorFree:
             work.workspace,
             cam_from_world=poses,
             masks=_masks(work),
+            number=options.model,
             seed=options.seed,
             progress=work.progress,
         )
@@ -198,6 +199,7 @@ class DetectorFree:
             model=made.model,
             features=made.features,
             matches=made.matches,
+            notes=made.notes,
             photos={name: shrink_photo(photos[name], self.max_image_size) for name in made.features},
         )
 

@@ -20,7 +20,8 @@ from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
 from slimsfm.mapping.extraction import color_points
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
-from slimsfm.mapping.sfm import reconstruct, triangulate, verified_matches, write_database
+from slimsfm.mapping.reconstruction import pick_model, reconstruct
+from slimsfm.mapping.sfm import triangulate, verified_matches, write_database
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.methods.loftr.cells import (
     CellKeypoints,
@@ -215,6 +216,9 @@ class KeypointFreeModel:
     matches: Matches
     """Verified matches between these keypoints."""
 
+    notes: tuple[str, ...] = ()
+    """What the user should know about the choice of the model."""
+
 
 def build_without_keypoints(
     photos: Mapping[str, Photo],
@@ -225,6 +229,7 @@ def build_without_keypoints(
     *,
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None = None,
     masks: Mapping[str, PhotoMask] | None = None,
+    number: int = 1,
     seed: int = 0,
     progress: ProgressBar = silent,
 ) -> KeypointFreeModel:
@@ -238,21 +243,24 @@ def build_without_keypoints(
         workspace: Folder for intermediate files.
         cam_from_world: Known poses by image name; then poses and cameras are not refined.
         masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
+        number: Which model to keep if there are several, from 1, the largest.
         seed: Seed of all random choices.
         progress: Progress callback.
 
     Raises:
-        InputError: A photo cannot be used.
+        InputError: A photo cannot be used, or there are fewer models.
         ReconstructionError: No model can be reconstructed from the photos.
     """
     cells = match_without_keypoints(photos, pairs, matcher, masks, progress)
-    rough, matches = _reconstruct(cells, cameras, cam_from_world, workspace, seed, progress)
+    rough, notes, matches = _reconstruct(cells, cameras, cam_from_world, workspace, number, seed, progress)
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
     if cam_from_world is None:
         _adjust(refined.model, max(1.0, float(np.median(list(cells.cell_px.values()))) / _CELL_PX))
     seen = refined.features.items()
     color_points(refined.model, {name: image_colors(photos[name], one.keypoints) for name, one in seen})
-    return KeypointFreeModel(model=refined.model, features=refined.features, matches=refined.matches(matches))
+    return KeypointFreeModel(
+        model=refined.model, features=refined.features, matches=refined.matches(matches), notes=notes
+    )
 
 
 def _reconstruct(
@@ -260,10 +268,11 @@ def _reconstruct(
     cameras: Mapping[str, pycolmap.Camera],
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None,
     workspace: Path,
+    number: int,
     seed: int,
     progress: ProgressBar,
-) -> tuple[pycolmap.Reconstruction, Matches]:
-    """Reconstruct a model from cells; also returns their verified matches.
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...], Matches]:
+    """Reconstruct a model from cells; also returns notes on it, and the verified matches.
 
     COLMAP's limits are in pixels, so images are scaled until a cell has 8 of them.
     """
@@ -275,13 +284,15 @@ def _reconstruct(
         camera.has_prior_focal_length |= cam_from_world is not None
     write_database(database, shrunk.features, small)
     verify_pairs(database, names, cells.matches, seed=seed, progress=progress)
+    notes: tuple[str, ...] = ()
     if cam_from_world is not None:
         model = triangulate(database, names, workspace / "sfm", cam_from_world, seed=seed, progress=progress)
     else:
-        model = reconstruct(database, names, workspace / "sfm", seed=seed, progress=progress)
+        models = reconstruct(database, names, workspace / "sfm", seed=seed, progress=progress)
+        model, notes = pick_model(models, number)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=cam_from_world is not None)
-    return model, matches
+    return model, notes, matches
 
 
 def _adjust(model: pycolmap.Reconstruction, scale_px: float) -> None:

@@ -1,0 +1,110 @@
+"""The quality of a model: what supports it, and what contradicts it."""
+
+from dataclasses import dataclass, field
+
+MIN_COMMON_POINTS = 15
+"""Points that two images must both see to be joined."""
+
+_MIN_FOCAL, _MAX_FOCAL = 0.2, 15.0  # focal length over the longer side of the image
+_FLAT_ANGLE_DEG, _FLAT_SPREAD = 5.0, 0.1  # of a camera that turns without moving
+_LISTED = 12  # names in a sentence
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelQuality:
+    """What supports a model, and what contradicts it."""
+
+    given: int
+    """Number of photos that the model was to be made of."""
+
+    registered: int
+    """Number of those that it contains."""
+
+    verified_pairs: int
+    """Number of pairs of its images with verified matches."""
+
+    contradicted_pairs: int
+    """Number of those pairs of which fewer than half of the matches agree with the model."""
+
+    trusted_pairs: int
+    """Number of pairs that are hard to doubt: see `mapping.support`."""
+
+    contradictions: dict[str, float] = field(default_factory=dict)
+    """Images of contradicted trusted pairs: the smallest share of the matches of such a pair that agrees."""
+
+    doubtful: tuple[str, ...] = ()
+    """Those images, and the images that share points with them: poses close to these are in doubt."""
+
+    median_observations: float
+    """Median number of points that an image observes."""
+
+    median_track_length: float
+    """Median number of images that observe a point."""
+
+    triangulation_angle_deg: float
+    """Median, over points, of the largest angle between two rays to the point."""
+
+    camera_spread: float
+    """Largest distance of a camera to the median camera, over the median distance from cameras to points."""
+
+    focal_lengths: dict[str, float] = field(default_factory=dict)
+    """Focal length over the longer side, by the name of the first image of each camera."""
+
+    focal_origins: dict[str, str] = field(default_factory=dict)
+    """First guess of these focal lengths: "EXIF", "guessed", "given" (known) or "model" (imported)."""
+
+    pieces: tuple[int, ...] = ()
+    """Number of images of each piece of the model, largest first; more than one is a fault."""
+
+    @property
+    def contradicted_share(self) -> float:
+        """Share of the images that belong to a contradicted trusted pair."""
+        return len(self.contradictions) / max(self.registered, 1)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Reasons why the model cannot be used. A model with contradictions can, with doubt."""
+        found = []
+        if len(self.pieces) > 1:
+            found.append(
+                f"its images fall into {len(self.pieces)} pieces of {', '.join(map(str, self.pieces[:5]))} "
+                f"images, with fewer than {MIN_COMMON_POINTS} common points between them"
+            )
+        if self.triangulation_angle_deg < _FLAT_ANGLE_DEG and self.camera_spread < _FLAT_SPREAD:
+            angle, spread = self.triangulation_angle_deg, self.camera_spread
+            found.append(
+                f"the camera turned but hardly moved (points are seen under {angle:.1f} degrees, cameras are "
+                f"spread over {spread:.0%} of the distance to them); walk around while taking photos"
+            )
+        for name, focal in self.focal_lengths.items():
+            if not _MIN_FOCAL <= focal <= _MAX_FOCAL:
+                found.append(f"the focal length of {name} would be {focal:.3g} times the image's longer side")
+        return tuple(found)
+
+    @property
+    def summary(self) -> str:
+        """One line on what supports the model."""
+        agreeing = self.verified_pairs - self.contradicted_pairs
+        focal_lengths = ", ".join(
+            f"{focal:.2f} ({self.focal_origins.get(name, 'refined')})"
+            for name, focal in list(self.focal_lengths.items())[:_LISTED]
+        )
+        return (
+            f"{self.registered} of {self.given} photos registered, {agreeing} of {self.verified_pairs} "
+            f"verified pairs agree, {len(self.contradictions)} images contradicted; per image a median of "
+            f"{self.median_observations:.0f} observations; {self.triangulation_angle_deg:.1f} degrees "
+            f"between rays; focal length over longer side {focal_lengths}"
+        )
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences on what contradicts the model, with names."""
+        if not self.contradictions:
+            return ()
+        shares = [f"{name} ({share:.0%})" for name, share in self.contradictions.items()]
+        more = f" and {len(shares) - _LISTED} more" if len(shares) > _LISTED else ""
+        return (
+            f"matches contradict the poses of {len(shares)} of {self.registered} images. The model may be "
+            "folded: parts that look alike are laid over each other, and poses may be wrong. Contradicted, "
+            f"with the share of matches that agree: {', '.join(shares[:_LISTED])}{more}",
+        )

@@ -1,0 +1,202 @@
+"""How well verified matches support a model.
+
+Structure from Motion lays look-alike parts of an object or a room over each other (the model is folded), and
+may join several places by chance. Such models are large and have small reprojection errors, but they
+contradict matches that are hard to doubt. Three measures tell them apart:
+
+    contradictions  of the trusted pairs of images, those of which fewer than half of the matches lie within
+                    4 px of their epipolar lines
+    pieces          images joined by at least 15 common points, directly or through others
+    parallax        the angle under which cameras see a point, and how far the cameras are apart
+
+The trusted pairs of an image are those with its neighbors in order of name, if they have at least half as
+many matches as its strongest pair; otherwise its strongest pair. What was photographed one after the other
+stands together, even where something else looks more alike. A fold breaks at least one such pair, because its
+images go once around what looks the same twice.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from slimsfm.arrays import IndexPairs, Points2D
+from slimsfm.mapping.model import camera_of
+from slimsfm.mapping.pairs import Matches, in_order
+from slimsfm.mapping.quality import MIN_COMMON_POINTS, ModelQuality
+
+Pair = tuple[str, str]
+
+MIN_AGREEING = 0.5
+"""Share of the matches of a pair below which a model contradicts it."""
+
+_MAX_ERROR_PX, _FULL_SIZE = 4.0, 1600  # from an epipolar line; in larger images in proportion
+_NEIGHBOR_SHARE = 0.5  # of the matches of the strongest pair that a neighbor needs to be trusted
+_SAMPLED = 2000  # points whose triangulation angle is measured
+
+
+def measure(model: pycolmap.Reconstruction, matches: Matches, names: Iterable[str]) -> ModelQuality:
+    """Measure the support of a model.
+
+    Args:
+        model: A model with named images.
+        matches: Verified matches by pair of image names; keypoints are those of the model.
+        names: All photos that the model was to be made of.
+    """
+    names = list(names)
+    images = {model.image(i).name: model.image(i) for i in sorted(model.reg_image_ids())}
+    agreeing = agreement(images, matches)
+    trusted = trusted_pairs(matches, names)
+    common = _common_points(model, list(images))
+    broken = {pair: agreeing[pair] for pair in trusted if agreeing.get(pair, 1.0) < MIN_AGREEING}
+    contradictions = {
+        name: min(broken[p] for p in broken if name in p) for name in sorted({*sum(broken, ())})
+    }
+    observations = [image.num_points3D for image in images.values()]
+    lengths = [point.track.length() for point in model.points3D.values()]
+    return ModelQuality(
+        given=len(names),
+        registered=len(images),
+        verified_pairs=len(agreeing),
+        contradicted_pairs=sum(share < MIN_AGREEING for share in agreeing.values()),
+        trusted_pairs=sum(pair in agreeing for pair in trusted),
+        contradictions=contradictions,
+        doubtful=_with_neighbors(contradictions, list(images), common),
+        median_observations=float(np.median(observations or [0])),
+        median_track_length=float(np.median(lengths or [0])),
+        triangulation_angle_deg=_triangulation_angle(model),
+        camera_spread=_camera_spread(model),
+        focal_lengths=_focal_lengths(images),
+        pieces=_pieces(common),
+    )
+
+
+def agreement(images: Mapping[str, pycolmap.Image], matches: Matches) -> dict[Pair, float]:
+    """Share of the matches of each pair of images that lie within 4 px of their epipolar lines.
+
+    Images of more than 1600 px may err by proportionally more.
+    """
+    rays = {name: _rays(image) for name, image in images.items()}
+    return {
+        (a, b): float(_agrees(images[a], images[b], rays[a], rays[b], matches[a, b]).mean())
+        for a, b in matches
+        if a in images and b in images and len(matches[a, b])
+    }
+
+
+def _rays(image: pycolmap.Image) -> Points2D:
+    pixels = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
+    return np.asarray(camera_of(image).cam_from_img(pixels), np.float64).reshape(-1, 2)
+
+
+def _agrees(
+    a: pycolmap.Image,
+    b: pycolmap.Image,
+    rays_a: Float64[np.ndarray, "_ 2"],
+    rays_b: Float64[np.ndarray, "_ 2"],
+    pairs: IndexPairs,
+) -> Bool[np.ndarray, " n"]:
+    essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
+    squared = pycolmap.compute_squared_sampson_error(rays_a[pairs[:, 0]], rays_b[pairs[:, 1]], essential)
+    cameras = camera_of(a), camera_of(b)
+    allowed = max(_MAX_ERROR_PX * _scale(camera) / camera.mean_focal_length() for camera in cameras)
+    return np.asarray(squared) < allowed**2
+
+
+def _scale(camera: pycolmap.Camera) -> float:
+    return max(1.0, max(camera.width, camera.height) / _FULL_SIZE)
+
+
+def trusted_pairs(matches: Matches, names: Iterable[str]) -> set[Pair]:
+    """The pairs of images whose matches are hard to doubt.
+
+    Those of an image with its neighbors in order of name, if they have at least half as many matches as its
+    strongest pair; otherwise its strongest pair.
+    """
+    count = {pair: len(matches[pair]) for pair in matches}
+    neighbors = {(min(pair), max(pair)) for pair in pairwise(in_order(names))}
+    of_image: dict[str, list[Pair]] = defaultdict(list)
+    for pair in sorted(count):
+        for name in pair:
+            of_image[name].append(pair)
+    trusted: set[Pair] = set()
+    for pairs in of_image.values():
+        strongest = max(pairs, key=count.__getitem__)
+        near = [p for p in pairs if p in neighbors and count[p] >= _NEIGHBOR_SHARE * count[strongest]]
+        trusted.update(near or [strongest])
+    return trusted
+
+
+def _common_points(model: pycolmap.Reconstruction, names: list[str]) -> csr_array:
+    """Number of points that two images see, of shape [images, images]."""
+    rows = {model_id: names.index(model.image(model_id).name) for model_id in model.reg_image_ids()}
+    seen = {
+        (rows[element.image_id], column)
+        for column, point in enumerate(model.points3D.values())
+        for element in point.track.elements
+    }
+    image_rows, columns = np.array(sorted(seen), np.int64).reshape(-1, 2).T
+    ones = np.ones(len(image_rows), np.int32)
+    observed = csr_array((ones, (image_rows, columns)), shape=(len(names), model.num_points3D()))
+    return observed @ observed.T
+
+
+def _pieces(common: csr_array) -> tuple[int, ...]:
+    _, labels = connected_components(common >= MIN_COMMON_POINTS)
+    return tuple(sorted(Counter(labels.tolist()).values(), reverse=True))
+
+
+def largest_piece(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The model without the images that hardly have a point in common with its largest piece."""
+    image_ids = sorted(model.reg_image_ids())
+    names = [model.image(i).name for i in image_ids]
+    _, labels = connected_components(_common_points(model, names) >= MIN_COMMON_POINTS)
+    largest = np.bincount(labels).argmax()
+    if np.all(labels == largest):
+        return model
+    kept = pycolmap.Reconstruction(model)
+    for image_id, label in zip(image_ids, labels.tolist(), strict=True):
+        if label != largest:
+            kept.deregister_frame(kept.image(image_id).frame_id)
+    return kept
+
+
+def _with_neighbors(names: Iterable[str], all_names: list[str], common: csr_array) -> tuple[str, ...]:
+    rows = [all_names.index(name) for name in names]
+    joined = np.flatnonzero((common[rows] >= MIN_COMMON_POINTS).sum(axis=0)) if rows else []
+    return tuple(all_names[row] for row in sorted({*rows, *np.asarray(joined, np.int64).tolist()}))
+
+
+def _triangulation_angle(model: pycolmap.Reconstruction) -> float:
+    centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
+    points = [model.point3D(i) for i in sorted(model.point3D_ids())]
+    angles = []
+    for point in points[:: max(1, len(points) // _SAMPLED)]:
+        seen_from = sorted({element.image_id for element in point.track.elements})
+        rays = np.array([centers[i] for i in seen_from]) - point.xyz
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def _camera_spread(model: pycolmap.Reconstruction) -> float:
+    centers = np.array([model.image(i).projection_center() for i in sorted(model.reg_image_ids())])
+    if not model.num_points3D() or not len(centers):
+        return 0.0
+    points: Float64[np.ndarray, "n 3"] = np.array([point.xyz for point in model.points3D.values()])
+    middle = np.median(centers, axis=0)
+    depth = float(np.median(np.linalg.norm(points - middle, axis=1)))
+    return float(np.linalg.norm(centers - middle, axis=1).max()) / max(depth, 1e-12)
+
+
+def _focal_lengths(images: Mapping[str, pycolmap.Image]) -> dict[str, float]:
+    first: dict[int, str] = {}
+    for name in sorted(images):
+        first.setdefault(images[name].camera_id, name)
+    cameras = {name: camera_of(images[name]) for name in first.values()}
+    return {name: c.mean_focal_length() / max(c.width, c.height) for name, c in cameras.items()}
