@@ -63,7 +63,7 @@ def measure(output: Path, name: str, features: int, size: int) -> tuple[float, l
 
 def localize(localizer: Localizer, query: PosedQuery) -> Localization:
     """From file to pose."""
-    return localizer.localize(read_image(query.path), query.camera)
+    return localizer.localize(read_image(query.path, query.orientation), query.camera)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,9 @@ import pytest
 from PIL import Image
 
 from slimsfm.errors import ImageError, InputError
+from slimsfm.exif import camera_from_exif
 from slimsfm.image_files import can_read_heic, find_images, is_image, list_images
-from slimsfm.photos import camera_from_exif, read_image
+from slimsfm.photos import read_image
 
 
 def picture(width=24, height=16):

@@ -1,4 +1,4 @@
-"""Image files: read their upright pixels, and guess their cameras from EXIF data.
+"""Image files: read their pixels, upright or as they are stored.
 
 Pixels of more than eight bits are scaled to eight by the bits that the image uses: 8, 10, 12, 14, 16 ... hold
 its largest value. So 12-bit values in a file of 16 bits are as bright as in one of 12. Floating-point values
@@ -8,17 +8,17 @@ that are no number are black.
 
 import logging
 import re
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
-import pycolmap
 from jaxtyping import Shaped, UInt8
 from PIL import ExifTags, ImageCms, UnidentifiedImageError
 from PIL import Image as PillowImage
@@ -27,16 +27,19 @@ from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError
 from slimsfm.image_files import INSTALL_HEIC, can_read_heic
 
+Orientation = Literal["upright", "stored"]
+"""Which pixels of an image file: turned upright according to its EXIF orientation, or as they are stored, as
+COLMAP and hloc read them."""
+
 _LOGGER = logging.getLogger(__name__)
 _UNREADABLE = (UnidentifiedImageError, OSError, EOFError, ValueError, SyntaxError, RuntimeError)
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-_GUESS = 1.2  # focal length over the longer side, as COLMAP guesses it
 _WIDE = "I", "F"  # first letters of Pillow's modes of more than eight bits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Photo:
-    """An upright image, and what its file says besides."""
+    """An image, upright or as it is stored, and what its file says besides."""
 
     image: Image
     """RGB."""
@@ -45,7 +48,7 @@ class Photo:
     """0 where the image is fully transparent, 255 elsewhere; None if it is nowhere."""
 
     orientation: int
-    """EXIF orientation that the stored pixels were turned by; 1 if not at all."""
+    """EXIF orientation of the file, from 1 to 8; 1 if it has none."""
 
     num_frames: int
     """Number of frames or pages in the file, of which this is the first."""
@@ -56,31 +59,39 @@ class Photo:
         return self.alpha if self.alpha is not None and self.alpha.any() else None
 
 
-def read_photo(path: str | Path, *, warn: bool = True) -> Photo:
-    """Read an image of any format, color mode and bit depth, turned upright by its EXIF orientation.
+def read_photo(path: str | Path, orientation: Orientation = "upright", *, warn: bool = True) -> Photo:
+    """Read an image of any format, color mode and bit depth.
 
     Args:
         path: The file; of several frames or pages the first is read.
+        orientation: Whether to turn the pixels upright by the EXIF orientation of the file.
         warn: Log a warning if there are several.
 
     Raises:
         ImageError: The file is missing, not a complete image, or too large.
+        ValueError: `orientation` is not a value of `Orientation`.
     """
+    if orientation not in get_args(Orientation):
+        raise ValueError(
+            f"orientation must be one of {', '.join(get_args(Orientation))}, got {orientation!r}"
+        )
     stored = _read(path)
     if warn and stored.num_frames > 1:
         _LOGGER.warning("%s: the first of %d frames or pages is used", path, stored.num_frames)
-    image = upright(_as_rgb(stored.values), stored.turn)
-    alpha = None if stored.alpha is None else upright(stored.alpha, stored.turn)
+    image, alpha = _as_rgb(stored.values), stored.alpha
+    if orientation == "upright":
+        image = upright(image, stored.orientation)
+        alpha = None if alpha is None else upright(alpha, stored.orientation)
     return Photo(image=image, alpha=alpha, orientation=stored.orientation, num_frames=stored.num_frames)
 
 
-def read_image(path: str | Path) -> Image:
-    """Read an image as upright RGB like `read_photo`, without its transparency.
+def read_image(path: str | Path, orientation: Orientation = "upright") -> Image:
+    """Read an image as RGB like `read_photo`, without its transparency.
 
     Raises:
         ImageError: As in `read_photo`.
     """
-    return read_photo(path).image
+    return read_photo(path, orientation).image
 
 
 class StoredMask(NamedTuple):
@@ -103,7 +114,7 @@ def read_stored_mask(path: str | Path) -> StoredMask:
     kept = stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2)
     if stored.alpha is not None:
         kept &= stored.alpha > 0
-    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.turn)
+    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.orientation)
 
 
 def read_mask(path: str | Path) -> GrayImage:
@@ -128,33 +139,58 @@ def upright(
     return np.ascontiguousarray(stored)
 
 
+def as_stored(
+    upright: Shaped[np.ndarray, "_ _ *channels"], orientation: int
+) -> Shaped[np.ndarray, "_ _ *channels"]:
+    """Turn upright pixels as a file of this EXIF orientation stores them."""
+    if orientation in (2, 3, 6, 7):
+        upright = upright[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        upright = upright[::-1]
+    if orientation >= 5:
+        upright = upright.swapaxes(0, 1)
+    return np.ascontiguousarray(upright)
+
+
+def exif_orientation(file: PillowImage.Image) -> int:
+    """The EXIF orientation of an open image file, from 1 to 8; 1, which is upright, if it has none."""
+    tag = exif_of(file).get(ExifTags.Base.Orientation, 1)
+    return tag if isinstance(tag, int) and 1 <= tag <= 8 else 1
+
+
+def exif_of(file: PillowImage.Image) -> dict[int, Any]:
+    """The EXIF data of an open image file by tag, with those of the lens; empty if they are damaged."""
+    try:
+        exif = file.getexif()
+        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except (SyntaxError, ValueError, KeyError, TypeError, struct.error):
+        return {}
+
+
 class _Stored(NamedTuple):
     values: Shaped[np.ndarray, "_ _ *channels"]  # gray or RGB of any depth
     alpha: GrayImage | None
     orientation: int
-    turn: int  # the orientation, or 1 if Pillow has turned the values already, as it does with TIFF
     num_frames: int
 
 
 def _read(path: str | Path) -> _Stored:
-    with _reading(path), opened_image(path) as file:
-        values, alpha = _deep_values(file, path), None  # first: once it decodes, Pillow forgets the depth
-        orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
+    with reading(path), opened_image(path) as file:
+        is_deep = _is_deep(file)  # first, because Pillow forgets the depth when it decodes
+        orientation = exif_orientation(file)
+        values, alpha = _deep_values(file, path) if is_deep else None, None
         # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
         num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
-        turn = orientation
         if values is None:
             values, alpha = _values(file)
-            turn = file.getexif().get(ExifTags.Base.Orientation, 1)
+            if exif_orientation(file) != orientation:  # Pillow turns TIFF files when it decodes them
+                values = as_stored(values, orientation)
+                alpha = None if alpha is None else as_stored(alpha, orientation)
         elif values.ndim == 3 and values.shape[2] == 4:
             values, alpha = values[..., :3], values[..., 3]
         if alpha is not None:
             alpha = None if alpha.all() else np.where(alpha, 255, 0).astype(np.uint8)
-        return _Stored(values, alpha, _valid(orientation), _valid(turn), num_frames)
-
-
-def _valid(orientation: object) -> int:
-    return orientation if isinstance(orientation, int) and orientation in range(1, 9) else 1
+        return _Stored(values, alpha, orientation, num_frames)
 
 
 def _values(
@@ -174,8 +210,6 @@ def _values(
 
 def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray, "_ _ _"] | None:
     """RGB or RGBA of 16 bits per channel, of which Pillow keeps the upper eight; None for other images."""
-    if file.mode.startswith(_WIDE) or not _is_deep(file):
-        return None
     file.load()  # OpenCV takes half a file for a whole one, Pillow does not
     found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.dtype != np.uint16 or found.ndim != 3:
@@ -184,6 +218,8 @@ def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray
 
 
 def _is_deep(file: PillowImage.Image) -> bool:
+    if file.mode.startswith(_WIDE):
+        return False
     arguments = [tile[3] for tile in getattr(file, "tile", [])]
     parts = [part for one in arguments for part in (one if isinstance(one, tuple) else (one,))]
     if file.format == "PPM":
@@ -238,7 +274,8 @@ def _register_heic() -> bool:
 
 
 @contextmanager
-def _reading(path: str | Path) -> Iterator[None]:
+def reading(path: str | Path) -> Iterator[None]:
+    """Report a file that cannot be read as an image as an `ImageError` that says what to do."""
     try:
         yield
     except FileNotFoundError as error:
@@ -253,32 +290,6 @@ def _reading(path: str | Path) -> Iterator[None]:
             f"{path}: not a readable image: damaged, or of a kind that is not supported; convert, replace or "
             "remove it"
         ) from error
-
-
-def camera_from_exif(path: str | Path) -> pycolmap.Camera:
-    """Guess the camera of an image: focal length from EXIF, or else 1.2 times the longer side.
-
-    Returns:
-        A SIMPLE_RADIAL camera of the upright image without distortion; `has_prior_focal_length` says
-        whether the focal length is from EXIF.
-
-    Raises:
-        ImageError: The file is missing or not an image.
-    """
-    with _reading(path), opened_image(path) as file:
-        turned = _valid(file.getexif().get(ExifTags.Base.Orientation)) >= 5
-        if file.format == "TIFF":  # Pillow turns it when it decodes, and its size before or then
-            file.load()
-            turned = False
-        upright_size = file.size[::-1] if turned else file.size
-        try:
-            camera = pycolmap.infer_camera_from_image(path)
-            focal_px, is_known = camera.focal_length, camera.has_prior_focal_length
-        except ValueError:  # COLMAP does not read this format
-            focal_px, is_known = _GUESS * max(upright_size), False
-    guess = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *upright_size)
-    guess.has_prior_focal_length = is_known
-    return guess
 
 
 def shrink(image: UInt8[np.ndarray, "_ _ *channels"], max_size: int) -> UInt8[np.ndarray, "_ _ *channels"]:

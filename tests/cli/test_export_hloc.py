@@ -67,11 +67,12 @@ def test_wrong_inputs_are_reported_in_one_line(map_path, queries, tmp_path):
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("kind", ["superpoint", "colmap"])
+@pytest.mark.parametrize("kind", ["superpoint", "nerf"])
 def test_an_unknown_kind_is_answered_by_the_known_ones(tmp_path, kind):
     outcome = slimsfm("export", kind, "-o", tmp_path / "x")
     assert outcome.code == 2
-    assert outcome.err == f"slimsfm: {kind!r} is not a subcommand of export; choose one of onnx, hloc\n"
+    known = "onnx, colmap, hloc"
+    assert outcome.err == f"slimsfm: {kind!r} is not a subcommand of export; choose one of {known}\n"
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)], ids=str)

@@ -1,6 +1,9 @@
+from typing import get_args
+
 import numpy as np
 import pytest
 
+from exif_photos import save_photo
 from scenes import camera, exact_map
 from slimsfm.evaluation.results import (
     PosedQuery,
@@ -10,6 +13,7 @@ from slimsfm.evaluation.results import (
     prepare_queries,
     queries_of,
 )
+from slimsfm.photos import Orientation
 from strategies import CLASSICAL
 
 
@@ -37,6 +41,15 @@ def test_outcomes_come_in_the_order_of_the_queries(narrow, queries, strategy):
     assert len(outcomes) == 8
     assert outcomes.error.max() < 1e-4
     assert outcomes.seconds[:, 0].tolist() == [0.25] * 8
+
+
+@pytest.mark.parametrize("orientation", get_args(Orientation))
+def test_queries_are_read_in_the_pixels_of_their_poses(narrow, textured, tmp_path, orientation):
+    path = save_photo(tmp_path / "a.png", textured, 6)
+    pose = narrow.images["001.png"].cam_from_world()
+    query = PosedQuery(path=path, camera=camera(), cam_from_world=pose, orientation=orientation)
+    (prepared,) = prepare_queries(narrow, [query])
+    assert prepared.features.image_size == ((320, 240) if orientation == "upright" else (240, 320))
 
 
 @pytest.mark.parametrize("strategy", CLASSICAL)

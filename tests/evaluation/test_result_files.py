@@ -49,7 +49,10 @@ def run(tmp_path):
             unit=unit,
             queries=tuple(
                 PosedQuery(
-                    path=Path("photos", f"{i}.png"), camera=camera(model), cam_from_world=random_pose(rng)
+                    path=Path("photos", f"{i}.png"),
+                    camera=camera(model),
+                    cam_from_world=random_pose(rng),
+                    orientation="stored" if name == "mug" else "upright",
                 )
                 for i in range(QUERIES)
             ),

@@ -1,5 +1,7 @@
 import csv
 import json
+from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pycolmap
@@ -9,6 +11,7 @@ from scenes import camera, poses
 from slimsfm.errors import OutputError
 from slimsfm.localization import Localization, Seconds
 from slimsfm.localization.pose_files import write_poses
+from slimsfm.photos import Orientation
 from slimsfm.pose import PoseEstimate
 
 TRUTH = dict(zip(["a.png", "b/deep.jpg", "c,d.png", "lost.png", "z.png"], poses(5), strict=True))
@@ -106,6 +109,21 @@ def test_colmap_reads_images_txt(results, tmp_path):
     read.read_text(tmp_path)
     images = sorted(read.images.values(), key=lambda image: image.image_id)
     assert_equal_poses({image.name: image.cam_from_world() for image in images})
+
+
+@pytest.mark.parametrize("orientation", get_args(Orientation))
+def test_every_format_says_which_pixels_a_pose_is_of(results, tmp_path, orientation):
+    turned = {name: replace(one, orientation=orientation) for name, one in results.items()}
+    for name in ("poses.json", "poses.csv", "poses.tum", "images.txt"):
+        write_poses(tmp_path / name, turned)
+    data = json.loads((tmp_path / "poses.json").read_text())
+    assert {image["orientation"] for image in data["images"]} == {orientation}
+    assert "orientation: whether" in data["convention"]
+    with (tmp_path / "poses.csv").open(newline="") as file:
+        assert {row["orientation"] for row in csv.DictReader(file)} == {orientation}
+    for name in ("poses.tum", "images.txt"):
+        comments = [line for line in (tmp_path / name).read_text().splitlines() if line.startswith("#")]
+        assert orientation in comments[-1]
 
 
 @pytest.mark.parametrize("name", ["poses.xml", "poses", "poses.json.gz"])

@@ -7,9 +7,9 @@ from PIL import ExifTags, Image
 
 from scenes import camera
 from slimsfm.errors import ImageError, InputError
+from slimsfm.exif import camera_from_exif
 from slimsfm.geometry import project
 from slimsfm.localization.cameras import guess_camera, query_camera, read_camera, scaled_camera
-from slimsfm.photos import camera_from_exif
 
 
 def photo(path, size=(640, 480), focal_35mm=None):
@@ -176,3 +176,17 @@ def test_an_unreadable_camera_file_is_named(tmp_path):
     for name in ("missing.txt", "bytes.txt", "."):
         with pytest.raises(InputError, match="not a readable camera file"):
             read_camera(tmp_path / name)
+
+
+@pytest.mark.parametrize("focal_35mm", [1, 5000, 65535])
+def test_an_impossible_focal_length_is_no_evidence_of_another_camera(
+    exact, two_cameras, tmp_path, focal_35mm
+):
+    path = photo(tmp_path / "a.jpg", focal_35mm=focal_35mm)
+    assert np.array_equal(query_camera(exact, path, None).params, camera().params)
+    with pytest.raises(
+        ImageError, match=rf"a\.jpg: .*FocalLengthIn35mmFilm {focal_35mm}, which is impossible"
+    ):
+        query_camera(two_cameras, path, None)
+    guessed = query_camera(two_cameras, path, None, "unknown")
+    assert guessed.focal_length == guess_camera(640, 480).focal_length

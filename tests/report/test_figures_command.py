@@ -112,7 +112,7 @@ def test_queries_of_equal_names_are_numbered_and_missing_photos_are_left_out(run
     photo = np.zeros((480, 640, 3), np.uint8)
     outcomes = result.measurements[0].map_runs[0].outcomes
     named = draw_queries(
-        replace(result, queries=queries), outcomes, lambda path: None if path == paths[1] else photo
+        replace(result, queries=queries), outcomes, lambda path, _: None if path == paths[1] else photo
     )
     assert [(one.name, one.caption[:3]) for one in named] == [("0000-1", "1/3"), ("0002-1", "3/3")]
 

@@ -1,4 +1,5 @@
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -52,6 +53,13 @@ def test_result_of_a_tracked_frame_is_complete(walked):
         localization = one.localization
         assert len(localization.points2D) == len(localization.points3D_in_world) == len(one.pose.inliers)
         assert localization.predicted_corner_error < 0.05
+
+
+def test_results_say_which_pixels_they_are_of(localizer, walk):
+    info = replace(localizer.map.info, orientation="stored")
+    stored = Localizer(replace(localizer.map, info=info), localizer.options)
+    for one in tracked(stored, [walk.images[0], walk.images[1], BLACK]):
+        assert one.localization.orientation == "stored"
 
 
 def test_poses_do_not_depend_on_the_duration_of_background_work(localizer, walk, walked, monkeypatch):

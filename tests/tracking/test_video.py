@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from commands import contents
+from exif_photos import STORED, save_photo
 from slimsfm.errors import ImageError, InputError, OutputError
 from slimsfm.tracking.video import VIDEO_FORMATS, open_frames, write_video
 
@@ -40,6 +41,15 @@ def test_written_video_is_read_back(tmp_path, suffix, size):
         height, width = size
         assert frame.image.shape == (height + height % 2, width + width % 2, 3)
         assert np.median(np.abs(frame.image[:height, :width].astype(int) - image)) <= 3
+
+
+@pytest.mark.parametrize("tag", STORED)
+def test_images_of_a_folder_are_read_in_the_pixels_of_the_map(tmp_path, tag):
+    image = pictures(1)[0]
+    save_photo(tmp_path / "a.png", image, tag)
+    (upright,), (stored,) = (open_frames(tmp_path, way).pictures for way in ("upright", "stored"))
+    assert np.array_equal(upright.image, image)
+    assert np.array_equal(stored.image, STORED[tag](image))
 
 
 def rotate_in_header(path):

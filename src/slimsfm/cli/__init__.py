@@ -70,6 +70,7 @@ COMMANDS = {
     "figures": Entry("figures_command:figures", "draw figures of a benchmark run for papers and slides"),
     "methods": Entry("methods_command:methods", "list extractors, matchers and strategies and their weights"),
     "export onnx": Entry("export_command:export_onnx", "a learned method as an ONNX file"),
+    "export colmap": Entry("export_command:export_colmap", "the model of a map as COLMAP reads it"),
     "export hloc": Entry("export_command:export_hloc", "a map as hloc reads it"),
     "synthesize": Entry("synthesize_command:synthesize_objects", "render objects with exact ground truth"),
     "demo": Entry("demo_command:demo", "do all of this on objects that it renders itself"),

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
-from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
+from slimsfm.cli.output import Stopwatch, check_output, console, finish_map, plural
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
@@ -37,5 +37,8 @@ def build_photos(
     if made.unregistered:
         names = ", ".join(made.unregistered)
         console.print(f"{len(made.unregistered)} photos could not be registered: {names}", style="yellow")
+    if turned := made.info.exif_orientations:
+        text = f"{plural(len(turned), 'photo')} turned upright by EXIF"
+        console.print(f"{text}; for COLMAP, `slimsfm export colmap` turns the model back", style="dim")
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} ({made.info.unit} unit)")
     finish_map(made, output, watch)

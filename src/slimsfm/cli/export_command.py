@@ -8,9 +8,12 @@ from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural, size
 from slimsfm.errors import OutputError
 from slimsfm.features.registry import export_method
-from slimsfm.files import check_writable
+from slimsfm.files import check_writable, replacing
+from slimsfm.image_files import named
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.io import read_map
+from slimsfm.mapping.map import Map
+from slimsfm.mapping.orientation import mirrored_images, stored_model, turns_to_stored
 
 
 def export_onnx(
@@ -42,10 +45,41 @@ def export_onnx(
     )
 
 
+def export_colmap(map: MapPath, /, output: OutputPath, overwrite: bool = False) -> None:
+    """Export the model of a map for COLMAP, in the pixels of the image files as they are stored.
+
+    COLMAP ignores the EXIF orientation of photos. The sparse/ of a map of upright pictures fits only photos
+    without one; the exported model fits all. Images whose orientation mirrors them are left out.
+
+    Args:
+        map: A map.
+        output: The folder of the model.
+        overwrite: Replace an existing output.
+    """
+    watch = Stopwatch()
+    check_output(output, map, overwrite=overwrite)
+    exported = read_map(map)
+    model = stored_model(exported)
+    with replacing(output, overwrite=overwrite) as partial:
+        partial.mkdir(parents=True)
+        model.write(partial)
+    _print_left_out(exported)
+    images, points = plural(model.num_images(), "image"), plural(model.num_points3D(), "point")
+    finish(f"{output}: {images}, {points}", watch)
+
+
+def _print_left_out(exported: Map) -> None:
+    if mirrored := mirrored_images(exported):
+        text = named("image(s) left out, because their EXIF orientation mirrors them", mirrored)
+        console.print(text, style="yellow", markup=False)
+
+
 def export_hloc(
     map: MapPath, /, output: OutputPath, queries: Path | None = None, overwrite: bool = False
 ) -> None:
     """Export a map for hloc's `match_features` and `localize_sfm`.
+
+    hloc ignores the EXIF orientation of photos, and so does what is exported, as `export colmap` does.
 
     The output folder contains sfm/, features.h5, references.txt, matches.h5 if the map has matches, and
     pairs-queries.txt if queries are given: every query with every image of the map.
@@ -61,8 +95,10 @@ def export_hloc(
     names = read_query_names(queries) if queries else []
     exported = read_map(map)
     write_hloc(exported, output, names, overwrite=overwrite)
-    images, points = plural(len(exported.images), "image"), plural(len(exported.point3D_ids), "point")
-    number = plural(len(names) * len(exported.images), "pair")
+    _print_left_out(exported)
+    num_images = len(turns_to_stored(exported))
+    images, points = plural(num_images, "image"), plural(len(exported.point3D_ids), "point")
+    number = plural(len(names) * num_images, "pair")
     pairs = f", {number} of {plural(len(names), 'query', 'queries')}" if queries else ""
     finish(f"{output}: {images}, {points}{pairs}", watch)
     console.print(

@@ -43,6 +43,10 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         "extractor": {"name": map.info.extractor, "options": map.info.extractor_options},
         "origin": map.info.origin,
         "notes": list(map.info.notes),
+        "orientation": map.info.orientation,
+        "exif_orientations": {
+            name: tag for name, tag in map.info.exif_orientations.items() if name in map.images
+        },
         "quality": asdict(map.info.quality) if map.info.quality else None,
         "bytes": sizes,
     }
@@ -69,5 +73,13 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
         **support,
         "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
         "extractor": info.extractor + (f" ({options})" if options else ""),
+        "pixels": _pixels(map),
         "size": ", ".join(f"{part} {size(number)}" for part, number in sizes.items()),
     }
+
+
+def _pixels(map: Map) -> str:
+    if map.info.orientation == "stored":
+        return "as stored, ignoring EXIF orientation"
+    turned = sum(name in map.images for name in map.info.exif_orientations)
+    return f"upright ({turned} of {plural(len(map.images), 'image')} turned by EXIF)" if turned else "upright"

@@ -1,7 +1,7 @@
 """The interface of data sets: objects with images to map and to localize, and models of objects."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -16,6 +16,7 @@ from slimsfm.geometry import Box
 from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -156,6 +157,9 @@ class PosedSequence:
     cam_from_world: tuple[pycolmap.Rigid3d, ...]
     """Pose of each image; the world is the frame of the object."""
 
+    orientation: Orientation = "upright"
+    """Which pixels of the files cameras and poses are of."""
+
     @property
     def image_paths(self) -> tuple[Path, ...]:
         """Paths of the image files."""
@@ -249,6 +253,7 @@ def map_object(
         unit=sequences.unit,
     )
     folder = sequences.mapping.folder
+    options = replace(options, orientation=sequences.mapping.orientation)
     return build_map(folder, options, known=known, workspace=workspace, progress=progress)
 
 

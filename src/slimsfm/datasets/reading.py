@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 from jaxtyping import Float64
-from PIL import ExifTags, ImageOps
 from PIL import Image as PilImage
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.photos import opened_image
+from slimsfm.exif import stored_size
+from slimsfm.photos import Orientation, exif_orientation, opened_image
 
 PIXEL_CENTER = 0.5
 """Both coordinates of the center of the top-left pixel in COLMAP's convention."""
@@ -197,8 +197,8 @@ def pinhole_camera(
     return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image after the EXIF rotation; reads only the header if possible.
+def image_size(path: Path, orientation: Orientation = "upright") -> tuple[int, int]:
+    """Width and height of an image, upright or as it is stored; reads only the header if possible.
 
     Raises:
         ImageError: The file is missing or not an image.
@@ -207,13 +207,9 @@ def image_size(path: Path) -> tuple[int, int]:
         with opened_image(path) as image:
             if image.format == "PNG" and "exif" not in image.info:
                 return image.size  # EXIF after the pixels would require decoding them
-            if image.format == "TIFF":
-                return ImageOps.exif_transpose(
-                    image
-                ).size  # before reading pixels, Pillow may return either size
-            turned = image.getexif().get(ExifTags.Base.Orientation, 1) >= 5
-            width, height = image.size
-            return (height, width) if turned else (width, height)
+            width, height = stored_size(image)
+            is_turned = orientation == "upright" and exif_orientation(image) >= 5
+            return (height, width) if is_turned else (width, height)
     except FileNotFoundError as error:
         raise ImageError(f"{path} cannot be read as an image: there is no such file") from error
     except _DAMAGED_IMAGE as error:

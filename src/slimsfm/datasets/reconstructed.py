@@ -139,11 +139,11 @@ class Colmap:
         )
 
     def _check_image(self, truth: Map, name: str) -> None:
-        path, camera = self.images / name, truth.camera(name)
-        if (size := image_size(path)) != (camera.width, camera.height):
+        path, camera, orientation = self.images / name, truth.camera(name), truth.info.orientation
+        if (size := image_size(path, orientation)) != (camera.width, camera.height):
             raise ImageError(
-                f"{path} has {size[0]}x{size[1]} pixels, but its camera in the model {camera.width}x"
-                f"{camera.height}: pass the images that the model was computed from"
+                f"{path} has {size[0]}x{size[1]} pixels, but its camera in the model "
+                f"{camera.width}x{camera.height}: pass the images that the model was computed from"
             )
 
 
@@ -202,6 +202,7 @@ def _sequence(truth: Map, folder: Path, names: Sequence[str]) -> PosedSequence:
         names=tuple(names),
         cameras=tuple(truth.camera(name) for name in names),
         cam_from_world=tuple(truth.images[name].cam_from_world() for name in names),
+        orientation=truth.info.orientation,
     )
 
 

@@ -109,6 +109,7 @@ def _query_to_json(query: PosedQuery) -> dict:
             "params": camera.params.tolist(),
         },
         "cam_from_world": _pose_to_json(query.cam_from_world),
+        **({"orientation": query.orientation} if query.orientation != "upright" else {}),
     }
 
 
@@ -117,6 +118,7 @@ def _query_from_json(data: dict) -> PosedQuery:
         path=Path(data["path"]),
         camera=pycolmap.Camera(**data["camera"]),
         cam_from_world=_pose_from_json(data["cam_from_world"]),
+        orientation=data.get("orientation", "upright"),
     )
 
 

@@ -18,7 +18,7 @@ from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.map import Map
-from slimsfm.photos import read_image, read_photo
+from slimsfm.photos import Orientation, read_image, read_photo
 from slimsfm.progress import ProgressBar, silent
 
 STAGES = ("extract", "match", "pose")
@@ -37,6 +37,9 @@ class PosedQuery:
 
     cam_from_world: pycolmap.Rigid3d
     """Its true pose in the frame of the map."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the file camera and pose are of."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -348,7 +351,7 @@ class PreparedQuery:
 def queries_of(sequence: PosedSequence) -> list[PosedQuery]:
     """The frames of a sequence as queries."""
     return [
-        PosedQuery(path=path, camera=camera, cam_from_world=pose)
+        PosedQuery(path=path, camera=camera, cam_from_world=pose, orientation=sequence.orientation)
         for path, camera, pose in zip(
             sequence.image_paths, sequence.cameras, sequence.cam_from_world, strict=True
         )
@@ -362,7 +365,7 @@ def prepare_queries(
     extractor = load_extractor(map.info.extractor, map.info.extractor_options)
     prepared = []
     for query in progress(queries, "extract query features"):
-        photo = read_photo(query.path)
+        photo = read_photo(query.path, query.orientation)
         start = perf_counter()
         features = extractor.extract(photo.image, photo.visible)
         seconds = perf_counter() - start
@@ -415,6 +418,7 @@ def evaluate(
 
 
 def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
-    image = read_image(prepared.query.path) if localizer.looks_at_images else None
-    found = localizer.localize_features(prepared.features, prepared.query.camera, image=image)
+    query = prepared.query
+    image = read_image(query.path, query.orientation) if localizer.looks_at_images else None
+    found = localizer.localize_features(prepared.features, query.camera, image=image)
     return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))

@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import pycolmap
 
@@ -15,7 +15,7 @@ from slimsfm.features import Features
 from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.photos import read_photo
+from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
 
@@ -47,7 +47,7 @@ class MultiLocalizer:
         """Search one image for every object.
 
         Args:
-            image: Upright RGB.
+            image: RGB, upright or as stored as the maps say.
             cameras: Intrinsics by name of the object; where they are missing or None, those of the object's
                 map are used.
             gravity: As in `Localizer.localize`; all maps must share one frame.
@@ -178,5 +178,12 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
 def _localize_one(
     localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
 ) -> dict[str, Localization]:
-    photo = read_photo(task.path)
-    return localizer.localize(photo.image, task.cameras, gravity.get(task.name), photo.visible)
+    """Localize an image against all maps; it is read as each of them says."""
+    found: dict[str, Localization] = {}
+    for orientation in get_args(Orientation):
+        alike = {k: one for k, one in localizer.localizers.items() if one.map.info.orientation == orientation}
+        if alike:
+            photo = read_photo(task.path, orientation)
+            multi, down = MultiLocalizer(alike), gravity.get(task.name)
+            found |= multi.localize(photo.image, task.cameras, down, photo.visible)
+    return {key: found[key] for key in localizer.localizers}

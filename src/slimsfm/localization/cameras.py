@@ -9,8 +9,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.errors import ImageError, InputError
+from slimsfm.exif import read_exif
 from slimsfm.mapping.map import Map
-from slimsfm.photos import camera_from_exif
 from slimsfm.pose.types import Gravity
 
 FocalLength = Literal["known", "approximate", "unknown"]
@@ -86,7 +86,7 @@ def guess_camera(width: int, height: int) -> pycolmap.Camera:
 def query_camera(
     map: Map, path: str | Path, given: pycolmap.Camera | None, focal: FocalLength = "known"
 ) -> pycolmap.Camera:
-    """Choose the intrinsics of a query image.
+    """Choose the intrinsics of a query image, read upright or as stored as the map says.
 
     In this order: the given camera; the camera that all reference images share, unless EXIF gives another
     focal length or the aspect ratio differs; the camera according to EXIF; a guess by `guess_camera`, if the
@@ -101,7 +101,8 @@ def query_camera(
     path = Path(path)
     if focal not in get_args(FocalLength):
         raise ValueError(f"focal must be one of {', '.join(get_args(FocalLength))}, got {focal!r}")
-    exif = camera_from_exif(path)
+    found = read_exif(path)
+    exif = found.camera(map.info.orientation)
     candidate = given or map.shared_camera
     scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
     if given and scaled is None:
@@ -115,7 +116,7 @@ def query_camera(
         return exif
     if focal == "known":
         raise UnknownIntrinsicsError(
-            f"{path}: its focal length is unknown (no EXIF data, and not taken with the map's camera); "
+            f"{path}: its focal length is unknown ({found.problem}, and not taken with the map's camera); "
             "give `camera=FILE`, or estimate it with `focal='unknown'`"
         )
     return guess_camera(exif.width, exif.height)
@@ -129,8 +130,8 @@ def read_gravity(path: str | Path) -> dict[str, Gravity]:
     """Read the direction of gravity per image, which phones record with their photos, from a JSON file.
 
     The file holds `{"world": [x, y, z], "images": {NAME: [x, y, z], ...}}`. The first vector points down in
-    the frame of the map, the others in the camera frames of the upright images (x right, y down, z forward).
-    Vectors may have any length.
+    the frame of the map, the others in the camera frames of the images (x right, y down, z forward), upright
+    or as stored as the map says. Vectors may have any length.
 
     Raises:
         InputError: The file is missing or has other contents.

@@ -17,6 +17,7 @@ from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.descriptors import descriptor_length
 from slimsfm.mapping.map import Map
+from slimsfm.photos import Orientation
 from slimsfm.pose import Gravity, PoseEstimate, RansacOptions
 
 # Paths, not classes: naming a strategy must not import its dependencies.
@@ -141,6 +142,9 @@ class Localization:
     seconds: Seconds
     """Wall time per stage."""
 
+    orientation: Orientation = "upright"
+    """Which pixels of the image the pose is of: as in the map."""
+
     @property
     def num_matches(self) -> int:
         """Number of 2D-3D matches."""
@@ -174,7 +178,7 @@ class Localizer:
         """Localize one image.
 
         Args:
-            image: Upright RGB.
+            image: RGB, upright or as stored as the map says (`read_image(path, map.info.orientation)`).
             camera: Its intrinsics. Default: the camera of the map, scaled to the image, if all reference
                 images share one of the same aspect ratio. A guess suffices if the focal length is not known.
             gravity: Direction of gravity in the map and in the image, as a phone measures it; used only if
@@ -199,7 +203,7 @@ class Localizer:
         project near them. Several times faster than `localize`, and finds more points.
 
         Args:
-            image: Upright RGB.
+            image: RGB, as in `localize`.
             camera: As in `localize`.
             near_cam_from_world: The approximate pose. Points must project within a twelfth of the image's
                 longer side of their true position.
@@ -235,7 +239,7 @@ class Localizer:
             features: Features of the image by `extractor`.
             camera: Its intrinsics.
             gravity: As in `localize`.
-            image: Upright RGB; needed only if `looks_at_images`.
+            image: RGB, as in `localize`; needed only if `looks_at_images`.
         """
         query = self._query(features, camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), 0.0)
@@ -256,6 +260,7 @@ class Localizer:
             references=found.references,
             predicted_corner_error=evidence and evidence.predicted_error,
             seconds=Seconds(extract=extract_seconds, match=found.match_seconds, pose=found.pose_seconds),
+            orientation=self.map.info.orientation,
         )
 
     def _query(self, features: Features, camera: pycolmap.Camera, image: Image | None = None) -> Query:
@@ -281,7 +286,7 @@ class Localizer:
         """Intrinsics of an image: those given, else those of the map, scaled, else a guess if that suffices.
 
         Args:
-            image: Upright RGB.
+            image: RGB, as in `localize`.
             given: Intrinsics to use.
 
         Raises:

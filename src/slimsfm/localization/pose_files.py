@@ -106,6 +106,7 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
             "confidence": one.pose and one.pose.confidence,
             "predicted_corner_error": one.predicted_corner_error,
             "covariance": one.pose and _covariance_to_json(one.pose),
+            "orientation": one.orientation,
             "focal_length_px": one.camera.mean_focal_length(),
             "inliers": one.pose.num_inliers if one.pose else 0,
             "matches": one.num_matches,
@@ -118,7 +119,8 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
         "cam_from_world: x_in_cam = R @ x_in_world + t; quaternions are x, y, z, w; "
         "confidence: probability of a corner error below a tenth of the box's diagonal; "
         "predicted_corner_error: over the diagonal; "
-        "covariance: of a turn (radians) and then a shift (map units) in the camera's frame"
+        "covariance: of a turn (radians) and then a shift (map units) in the camera's frame; "
+        "orientation: whether the camera is that of the upright image or of its stored pixels"
     )
     json.dump({"convention": convention, "images": images}, file, indent=2)
     file.write("\n")
@@ -147,11 +149,12 @@ def _write_csv(file: TextIO, rows: list[_Row]) -> None:
     times = ["ms_extract", "ms_match", "ms_pose", "ms_total"]
     pose = ["qw", "qx", "qy", "qz", "tx", "ty", "tz", "confidence", "inliers", "matches"]
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([*(rows[0][0] if rows else ["name"]), *pose, *times])
+    writer.writerow([*(rows[0][0] if rows else ["name"]), *pose, *times, "orientation"])
     for label, one in rows:
         values = [*_colmap_values(one.pose.cam_from_world), one.pose.confidence] if one.pose else [""] * 8
         inliers = one.pose.num_inliers if one.pose else 0
-        writer.writerow([*label.values(), *values, inliers, one.num_matches, *_milliseconds(one).values()])
+        counts, times_ms = (inliers, one.num_matches), _milliseconds(one).values()
+        writer.writerow([*label.values(), *values, *counts, *times_ms, one.orientation])
 
 
 def _colmap_values(cam_from_world: pycolmap.Rigid3d) -> list[float]:
@@ -160,7 +163,14 @@ def _colmap_values(cam_from_world: pycolmap.Rigid3d) -> list[float]:
     return [w, x, y, z, *cam_from_world.translation.tolist()]
 
 
+def _pixels(rows: list[_Row]) -> str:
+    """Whose poses these are, for a comment; all queries of one map are read alike."""
+    is_stored = any(one.orientation == "stored" for _, one in rows)
+    return "images as they are stored, ignoring EXIF orientation" if is_stored else "upright images"
+
+
 def _write_tum(file: TextIO, rows: list[_Row]) -> None:
+    file.write(f"# index tx ty tz qx qy qz qw of the cameras of {_pixels(rows)}\n")
     for index, (_, one) in enumerate(rows):
         if one.pose:
             world_from_cam = one.pose.cam_from_world.inverse()
@@ -170,6 +180,7 @@ def _write_tum(file: TextIO, rows: list[_Row]) -> None:
 
 def _write_colmap(file: TextIO, rows: list[_Row]) -> None:
     file.write("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then an empty line: no keypoints\n")
+    file.write(f"# of the cameras of {_pixels(rows)}\n")
     for index, (label, one) in enumerate(rows, start=1):
         if one.pose:
             values = " ".join(repr(value) for value in _colmap_values(one.pose.cam_from_world))

@@ -11,6 +11,7 @@ import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, ReconstructionError
+from slimsfm.exif import Exif, ignored_values, read_exif, read_orientation
 from slimsfm.features import Extractor, Features, load_extractor, load_matcher
 from slimsfm.geometry import Box
 from slimsfm.mapping.descriptors import with_global_descriptors
@@ -19,18 +20,21 @@ from slimsfm.mapping.extraction import CameraSharing, color_points, extract_feat
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos, find_photos
 from slimsfm.mapping.model import estimate_box, read_box
+from slimsfm.mapping.orientation import TurnedFeatures, turned_model
 from slimsfm.mapping.pairs import Matches, PairChoice, choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.reconstruction import pick_model, reconstruct
 from slimsfm.mapping.sfm import (
     colmap_warnings,
     match_pairs,
+    put_keypoints,
     triangulate,
     verified_matches,
     write_database,
 )
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.support import measure
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -39,8 +43,12 @@ class BuildOptions:
     """How a map is built from photos."""
 
     camera: CameraSharing = "auto"
-    """Images that share a camera: all (shared), none (per-image), or images of equal size and EXIF focal
-    length (auto)."""
+    """Images that share a camera: all (shared), none (per-image), or images of equal size and, by EXIF, equal
+    focal length and device (auto). Width and height may be swapped."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the photos to map: turned upright according to EXIF, or as they are stored, as COLMAP
+    does. Queries are read alike."""
 
     pairs: PairChoice = "auto"
     """Pairs of images to match: all (exhaustive), neighbors in order of name (sequential), or images that
@@ -137,20 +145,24 @@ def build_map(
         raise InputError("; ".join([few, *notes]))
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
-    photos = MaskedPhotos(images, names, options.masks, options.alpha)
-    cameras = known.cameras if known else guess_cameras(images, names, options.camera)
+    photos = MaskedPhotos(images, names, options.masks, options.alpha, options.orientation)
+    exifs = {} if known else {name: read_exif(images / name) for name in names}
+    guessed = guess_cameras(exifs, options.camera, options.orientation)
+    notes = (*notes, *ignored_values(exifs))
     with _opened(workspace) as folder, colmap_warnings():
         work = BuildWork(
             images=images,
             photos=photos,
             names=names,
             workspace=folder,
-            cameras=cameras,
+            cameras=known.cameras if known else guessed.by_name,
+            turned=guessed.turned,
             known=known,
             progress=progress,
         )
         try:
             if isinstance(extractor, ModelBuilder):
+                _check_not_turned(work, options)
                 parts = extractor.build_model(work, options)
             else:
                 parts = _parts_with_keypoints(work, extractor, options)
@@ -164,8 +176,10 @@ def build_map(
         box_source="given" if given_box else "estimated",
         unit=known.unit if known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if known else ""),
-        quality=replace(quality, focal_origins=_origins(quality, cameras, known)),
+        quality=replace(quality, focal_origins=_origins(quality, work.cameras, known)),
         notes=(*notes, *photos.notes, *parts.notes),
+        orientation=options.orientation,
+        exif_orientations=_exif_orientations(work, exifs) if options.orientation == "upright" else {},
     )
     registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     made = Map(
@@ -177,6 +191,14 @@ def build_map(
         unregistered=tuple(name for name in names if name not in registered),
     )
     return with_global_descriptors(made)
+
+
+def _exif_orientations(work: "BuildWork", exifs: Mapping[str, Exif]) -> dict[str, int]:
+    tags = {
+        name: exifs[name].orientation if exifs else read_orientation(work.images / name)
+        for name in work.names
+    }
+    return {name: tag for name, tag in tags.items() if tag != 1}
 
 
 def _origins(
@@ -218,6 +240,9 @@ class BuildWork:
 
     cameras: Mapping[str, pycolmap.Camera]
     """Intrinsics by image name; images with equal `camera_id` share a camera."""
+
+    turned: Mapping[str, pycolmap.Camera]
+    """Images taken with the camera of others, held turned by 90°: the camera of the others."""
 
     known: KnownPoses | None
     """Known poses, if any: then points are triangulated and nothing else is estimated."""
@@ -266,8 +291,9 @@ class ModelBuilder(Protocol):
 def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     output, names = work.workspace / "features.h5", work.names
     features, colors = extract_features(work.photos, names, extractor, output, work.progress)
-    shrunk = ShrunkImages.by_extractor(features, work.cameras, extractor.options)
-    database, sfm = _match(work, shrunk, options), work.workspace / "sfm"
+    sideways = TurnedFeatures(features, dict.fromkeys(work.turned, 1))
+    shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
+    database, sfm = _match(work, features, shrunk, options), work.workspace / "sfm"
     seed, progress = options.seed, work.progress
     notes: tuple[str, ...] = ()
     if work.known:
@@ -285,6 +311,10 @@ def _parts_with_keypoints(work: BuildWork, extractor: Extractor, options: BuildO
         model, notes = pick_model(models, options.model)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=work.known is not None)
+    if work.turned:
+        turns_back = {image.name: -int(image.name in work.turned) for image in model.images.values()}
+        model = turned_model(model, turns_back)
+        put_keypoints(model, features)
     color_points(model, colors)
     return MapParts(extractor=extractor, model=model, features=features, matches=matches, notes=notes)
 
@@ -296,8 +326,10 @@ def _extractor(options: BuildOptions) -> Extractor:
     )
 
 
-def _match(work: BuildWork, shrunk: ShrunkImages, options: BuildOptions) -> Path:
-    database, features = work.workspace / "database.db", shrunk.whole
+def _match(
+    work: BuildWork, features: Mapping[str, Features], shrunk: ShrunkImages, options: BuildOptions
+) -> Path:
+    database = work.workspace / "database.db"
     write_database(database, shrunk.features, shrunk.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
@@ -307,3 +339,11 @@ def _match(work: BuildWork, shrunk: ShrunkImages, options: BuildOptions) -> Path
         matches = match_pairs_with(matcher, features, pairs, work.progress)
         verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
     return database
+
+
+def _check_not_turned(work: BuildWork, options: BuildOptions) -> None:
+    if work.turned and options.camera == "shared":
+        raise InputError(
+            f"{min(work.turned)}: width and height are swapped, and without a detector such images cannot "
+            "share a camera with the others; use `camera='auto'`"
+        )

@@ -1,6 +1,8 @@
 """Cameras, local features and colors of a folder of photos."""
 
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -9,10 +11,11 @@ import pycolmap
 from jaxtyping import UInt8
 
 from slimsfm.errors import InputError
+from slimsfm.exif import Exif
 from slimsfm.features import Extractor, image_colors
 from slimsfm.features.store import FeatureFile, FeatureWriter
 from slimsfm.mapping.masked_photos import MaskedPhotos
-from slimsfm.photos import camera_from_exif
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar
 
 CameraSharing = Literal["auto", "shared", "per-image"]
@@ -21,39 +24,61 @@ Colors = Mapping[str, UInt8[np.ndarray, "n 3"]]
 """RGB at each keypoint, by image name."""
 
 
-def guess_cameras(images: Path, names: list[str], sharing: CameraSharing) -> dict[str, pycolmap.Camera]:
-    """Guess the camera of each image from EXIF; images with equal `camera_id` share a camera.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GuessedCameras:
+    """Cameras of images, guessed from EXIF."""
 
-    With "auto", images of equal size and focal length share a camera; with "shared" all do, with "per-image"
-    none.
+    by_name: Mapping[str, pycolmap.Camera]
+    """The camera of each image in its own pixels; images with equal `camera_id` share a camera."""
+
+    turned: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
+    """Images taken with the camera of others, held turned by 90°: the camera of the others."""
+
+
+def guess_cameras(
+    exifs: Mapping[str, Exif], sharing: CameraSharing, orientation: Orientation = "upright"
+) -> GuessedCameras:
+    """Guess the camera of each image from its EXIF data, by name.
+
+    With "auto", images of equal size, focal length and device share a camera; with "shared" all do, with
+    "per-image" none. Pictures of swapped width and height are of one camera, held upright and sideways.
 
     Raises:
-        InputError: An image cannot be read, or images of different sizes share a camera.
+        InputError: Images of different sizes share a camera.
     """
-    guesses = {name: camera_from_exif(images / name) for name in names}
+    guesses = {name: exif.camera(orientation) for name, exif in exifs.items()}
     if sharing == "shared":
         _check_equal_sizes(guesses)
-    first: dict[tuple, pycolmap.Camera] = {}
+    groups: dict[tuple, list[str]] = {}
     for name, camera in guesses.items():
-        camera.camera_id = len(first) + 1
-        first.setdefault(_key(name, camera, sharing), camera)
-    return {name: first[_key(name, camera, sharing)] for name, camera in guesses.items()}
+        groups.setdefault(_key(name, exifs[name], camera, sharing), []).append(name)
+    by_name, turned = {}, {}
+    for names in groups.values():
+        first: dict[int, pycolmap.Camera] = {}  # by width
+        for name in names:
+            guesses[name].camera_id = 1 + len({camera.camera_id for camera in by_name.values()})
+            by_name[name] = first.setdefault(guesses[name].width, guesses[name])
+        widths = Counter(by_name[name].width for name in names)
+        usual = max(widths, key=lambda width: (widths[width], width))
+        turned |= {name: first[usual] for name in names if by_name[name].width != usual}
+    return GuessedCameras(by_name={name: by_name[name] for name in exifs}, turned=turned)
 
 
-def _key(name: str, camera: pycolmap.Camera, sharing: CameraSharing) -> tuple:
+def _key(name: str, exif: Exif, camera: pycolmap.Camera, sharing: CameraSharing) -> tuple:
     if sharing == "shared":
         return ()
     if sharing == "per-image":
         return (name,)
-    return (camera.width, camera.height, round(camera.focal_length, 2))
+    return (*sorted(exif.stored_size), round(camera.focal_length, 2), exif.device)
 
 
-def _check_equal_sizes(guesses: dict[str, pycolmap.Camera]) -> None:
-    sizes = {(camera.width, camera.height): name for name, camera in guesses.items()}
+def _check_equal_sizes(guesses: Mapping[str, pycolmap.Camera]) -> None:
+    sizes = {tuple(sorted((camera.width, camera.height))): name for name, camera in guesses.items()}
     if len(sizes) > 1:
-        (size_a, a), (size_b, b) = list(sizes.items())[:2]
+        a, b = (guesses[name] for name in list(sizes.values())[:2])
+        name_a, name_b = list(sizes.values())[:2]
         raise InputError(
-            f"{a} has {size_a[0]}x{size_a[1]} pixels, {b} {size_b[0]}x{size_b[1]}; "
+            f"{name_a} has {a.width}x{a.height} pixels, {name_b} {b.width}x{b.height}; "
             "images that share a camera must have the same size, so use `camera='auto'`"
         )
 

@@ -9,10 +9,11 @@ OUT/
 
 hloc multiplies descriptors as they are stored, so bytes become half floats of unit length. It measures
 orientations in degrees. Keypoints stay single floats: hloc's half floats are off by up to a quarter of a
-pixel beyond column 512, and by half a pixel beyond column 1024.
+pixel beyond column 512, and by half a pixel beyond column 1024. hloc reads images as they are stored and
+ignores their EXIF orientation, so a map of upright pictures is turned; mirrored images are left out.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from slimsfm.features.store import FeatureWriter, indistinct_names, write_matche
 from slimsfm.files import replacing
 from slimsfm.image_files import list_images
 from slimsfm.mapping.map import Map, check_num_features
+from slimsfm.mapping.orientation import stored_model, turned_features, turns_to_stored
 
 
 def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overwrite: bool = False) -> None:
@@ -52,15 +54,17 @@ def write_hloc(map: Map, path: str | Path, queries: Iterable[str] = (), *, overw
             f"{indistinct[0]!r}: hloc's matches cannot tell this name from another that has - instead of /; "
             "rename the image"
         )
-    pairs = _pairs(queries, map)
+    turns, model = turns_to_stored(map), stored_model(map)
+    pairs = _pairs(queries, map, list(turns))
     with replacing(Path(path), overwrite=overwrite) as partial:
         (partial / "sfm").mkdir(parents=True)
-        map.model.write(partial / "sfm")
-        _write_features(map, partial / "features.h5")
+        model.write(partial / "sfm")
+        _write_features(map, turns, partial / "features.h5")
         if map.matches:
             counts = {name: image.num_points2D() for name, image in map.images.items()}
-            write_matches(partial / "matches.h5", map.matches, counts)
-        _write_lines(partial / "references.txt", map.images)
+            kept = {pair: map.matches[pair] for pair in map.matches if turns.keys() >= set(pair)}
+            write_matches(partial / "matches.h5", kept, counts)
+        _write_lines(partial / "references.txt", turns)
         if pairs:
             _write_lines(partial / "pairs-queries.txt", (f"{query} {name}" for query, name in pairs))
 
@@ -97,8 +101,8 @@ def _name(line: str, path: Path) -> str:
     return name
 
 
-def _pairs(queries: Iterable[str], map: Map) -> list[tuple[str, str]]:
-    pairs = [(query, name) for query in queries for name in map.images]
+def _pairs(queries: Iterable[str], map: Map, references: list[str]) -> list[tuple[str, str]]:
+    pairs = [(query, name) for query in queries for name in references]
     for name in dict.fromkeys(name for pair in pairs for name in pair):
         if len(name.split()) > 1:
             raise InputError(f"{name!r}: hloc cannot read pairs of names with spaces; rename the image")
@@ -111,12 +115,12 @@ def _pairs(queries: Iterable[str], map: Map) -> list[tuple[str, str]]:
     return pairs
 
 
-def _write_features(map: Map, path: Path) -> None:
+def _write_features(map: Map, turns: Mapping[str, int], path: Path) -> None:
     with FeatureWriter(path) as writer:
-        for name, image in map.images.items():
+        for name, turn in turns.items():
             features = map.features[name]
-            check_num_features(image, len(features))
-            writer.write(name, _as_in_hloc(features))
+            check_num_features(map.images[name], len(features))
+            writer.write(name, _as_in_hloc(turned_features(features, turn)))
 
 
 def _as_in_hloc(features: Features) -> Features:

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 
 from slimsfm.errors import ModelError
+from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.store import stored_name
 from slimsfm.mapping.agreement import Masks, counted, place_features, positions
@@ -28,6 +29,7 @@ from slimsfm.mapping.sources import (
 )
 from slimsfm.mapping.support import measure
 from slimsfm.mapping.usable_matches import usable_matches
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
 
@@ -49,6 +51,10 @@ class ImportOptions:
 
     extractor: str = "sift"
     """Extractor of `features`, which is also used for queries. Needs `features`."""
+
+    orientation: Orientation = "stored"
+    """Which pixels of the image files the model is of: as they are stored, as in COLMAP and hloc, or turned
+    upright according to EXIF. Queries are read alike."""
 
     box: Path | None = None
     """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
@@ -114,6 +120,8 @@ def import_colmap(
         origin=f"imported COLMAP model with descriptors from {source.origin}",
         quality=_quality(model, matches) if matches else None,
         notes=(*notes, *source.notes, *more, *left_out),
+        orientation=options.orientation,
+        exif_orientations=_tags(model, options),
     )
     return with_global_descriptors(Map(model=model, features=features, matches=matches, info=info))
 
@@ -123,13 +131,20 @@ def _quality(model: pycolmap.Reconstruction, matches: Matches) -> ModelQuality:
     return replace(quality, focal_origins=dict.fromkeys(quality.focal_lengths, "model"))
 
 
+def _tags(model: pycolmap.Reconstruction, options: ImportOptions) -> dict[str, int]:
+    if options.orientation == "stored" or options.images is None:
+        return {}
+    tags = {image.name: read_orientation(options.images / image.name) for image in _posed_images(model)}
+    return {name: tag for name, tag in tags.items() if tag != 1}
+
+
 def _find_source(
     model_path: Path, images: list[pycolmap.Image], options: ImportOptions, progress: ProgressBar
 ) -> Source:
     if options.features:
         return from_hloc(images, options.features, options.matches, options.extractor)
     if options.images:
-        return from_images(images, options.images, progress)
+        return from_images(images, options.images, progress, options.orientation)
     return from_database(images, options.database or database_of(model_path))
 
 

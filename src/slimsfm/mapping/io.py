@@ -7,7 +7,7 @@ MAP/
   photos.h5     shrunk photos; in maps built without a detector
   global.npz    global descriptors of the images; may be missing
   points.npz    points for direct matching; in reduced maps, often instead of features.h5 and matches.h5
-  map.json      format version, extractor and its options, box, unit, origin
+  map.json      format version, extractor and its options, box, unit, origin, notes, orientation
 """
 
 import json
@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import h5py
@@ -37,7 +37,7 @@ from slimsfm.mapping.descriptors import (
 from slimsfm.mapping.map import Map, MapInfo, check_map, check_num_features
 from slimsfm.mapping.model import read_model
 from slimsfm.mapping.quality import ModelQuality
-from slimsfm.photos import shrink
+from slimsfm.photos import Orientation, shrink
 
 _QUALITY = 95
 
@@ -165,7 +165,7 @@ def write_map(map: Map, path: str | Path, *, overwrite: bool = False) -> None:
             write_global_descriptors(partial / "global.npz", map.global_descriptors)
         if map.point_descriptors:
             write_point_descriptors(partial / "points.npz", map.point_descriptors)
-        (partial / "map.json").write_text(json.dumps(_info_to_json(map.info), indent=2) + "\n")
+        (partial / "map.json").write_text(json.dumps(_info_to_json(map), indent=2) + "\n")
 
 
 def _write_features(map: Map, path: Path) -> None:
@@ -197,7 +197,9 @@ def bytes_by_part(path: Path) -> dict[str, int]:
     return {**sizes, "total": sum(sizes.values())}
 
 
-def _info_to_json(info: MapInfo) -> dict:
+def _info_to_json(map: Map) -> dict:
+    info = map.info
+    tags = {name: info.exif_orientations[name] for name in map.images if name in info.exif_orientations}
     return {
         "format_version": FORMAT_VERSION,
         "extractor": {"name": info.extractor, "options": info.extractor_options},
@@ -209,6 +211,8 @@ def _info_to_json(info: MapInfo) -> dict:
         "unit": info.unit,
         "origin": info.origin,
         "notes": list(info.notes),
+        "orientation": info.orientation,
+        **({"exif_orientations": tags} if tags else {}),
         "quality": None if info.quality is None else asdict(info.quality),
     }
 
@@ -222,6 +226,13 @@ def _quality(data: dict[str, Any] | None) -> ModelQuality | None:
 
 def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
     return np.array(values, np.float64).reshape(shape)
+
+
+def _orientation(value: object) -> Orientation:
+    for known in get_args(Orientation):
+        if value == known:
+            return known
+    raise ValueError(f"orientation must be one of {', '.join(get_args(Orientation))}, got {value!r}")
 
 
 def _read_info(path: Path) -> MapInfo:
@@ -243,6 +254,10 @@ def _read_info(path: Path) -> MapInfo:
             origin=data["origin"],
             notes=tuple(map(str, data.get("notes", ()))),
             quality=_quality(data.get("quality")),
+            orientation=_orientation(data.get("orientation", "upright")),
+            exif_orientations={
+                str(name): int(tag) for name, tag in data.get("exif_orientations", {}).items()
+            },
         )
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error

@@ -17,6 +17,7 @@ from slimsfm.features import Features, NearestOptions, shrink_factor
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
 from slimsfm.mapping.quality import ModelQuality
+from slimsfm.photos import Orientation
 
 MapKind = Literal["full", "images", "points", "images and points"]
 
@@ -48,6 +49,13 @@ class MapInfo:
 
     notes: tuple[str, ...] = ()
     """Sentences, with names, on what was skipped, ignored or guessed when the map was made."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the image files model, features and poses are of. Queries are read alike."""
+
+    exif_orientations: Mapping[str, int] = field(default_factory=dict)
+    """EXIF orientation of the images of an upright map, by name, where it is not 1. Empty in maps of version
+    0.1, which did not record it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

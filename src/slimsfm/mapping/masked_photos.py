@@ -2,8 +2,8 @@
 
 A mask is a PNG file whose name is that of the photo plus `.png`, or, if there is none, that of the photo with
 its suffix replaced by `.png`. Both are COLMAP's rules. What is not black in it is kept, whatever its bit
-depth. A mask is as upright as its photo: an orientation tag of its own turns it; without one, a mask that
-only fits the pixels as they are stored is turned with the photo. Transparent pixels of a photo hold no
+depth. A mask is as upright as its photo is read: an orientation tag of its own turns it; without one, a mask
+that only fits the photo turned the other way is turned with it. Transparent pixels of a photo hold no
 features either, unless they are told to.
 """
 
@@ -15,7 +15,7 @@ from typing import Literal
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, InputError
 from slimsfm.image_files import FoundImages, find_images, named
-from slimsfm.photos import Photo, read_photo, read_stored_mask, upright
+from slimsfm.photos import Orientation, Photo, as_stored, read_photo, read_stored_mask, upright
 
 AlphaUse = Literal["mask", "ignore"]
 """What transparency does: fully transparent pixels hold no features, or are like any others."""
@@ -23,7 +23,7 @@ AlphaUse = Literal["mask", "ignore"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MaskedPhoto:
-    """An upright photo and which of its pixels may hold features."""
+    """A photo and which of its pixels may hold features."""
 
     image: Image
     """RGB."""
@@ -46,7 +46,12 @@ class MaskedPhotos:
     """Reads the photos of a folder with their masks, and remembers what is to be said about them."""
 
     def __init__(
-        self, folder: Path, names: list[str], masks: Path | None = None, alpha: AlphaUse = "mask"
+        self,
+        folder: Path,
+        names: list[str],
+        masks: Path | None = None,
+        alpha: AlphaUse = "mask",
+        orientation: Orientation = "upright",
     ) -> None:
         """Find the masks.
 
@@ -55,11 +60,13 @@ class MaskedPhotos:
             names: The photos, relative to the folder.
             masks: Folder of masks; None for none.
             alpha: What transparency does.
+            orientation: Whether photos are read upright or as they are stored.
 
         Raises:
             InputError: The folder of masks does not exist or holds no mask of these photos.
         """
         self._folder, self._names, self._alpha = folder, names, alpha
+        self._orientation: Orientation = orientation
         self._masks: dict[str, Path] = {}
         self._said: dict[str, set[str]] = defaultdict(set)
         if masks is not None:
@@ -71,7 +78,7 @@ class MaskedPhotos:
         Raises:
             ImageError: The photo or its mask is unreadable, or they differ in size.
         """
-        photo = read_photo(self._folder / name, warn=False)
+        photo = read_photo(self._folder / name, self._orientation, warn=False)
         if photo.num_frames > 1:
             self._said["photo(s) of several frames or pages, of which the first is used"].add(name)
         mask = self._mask(name, photo)
@@ -125,19 +132,21 @@ class MaskedPhotos:
         path, shape = self._masks.get(name), photo.image.shape[:2]
         if path is None:
             return None
-        stored, orientation = read_stored_mask(path)
-        mask = upright(stored, orientation)
-        if photo.orientation != 1 and orientation == 1:
-            turned = upright(mask, photo.orientation)
+        is_stored = self._orientation == "stored"
+        mask, orientation = read_stored_mask(path)
+        if orientation != 1:
+            mask = upright(mask, orientation)
+            mask = as_stored(mask, photo.orientation) if is_stored else mask
+        elif photo.orientation != 1:
+            turned = (as_stored if is_stored else upright)(mask, photo.orientation)
             if mask.shape == turned.shape == shape:
-                self._said[
-                    "mask(s) taken as upright, because their photo is turned and they fit both ways"
-                ].add(path.name)
+                as_read = f"mask(s) taken as {self._orientation}"
+                self._said[f"{as_read}, because their photo is turned and they fit both ways"].add(path.name)
             elif turned.shape == shape:
                 mask = turned
         if mask.shape != shape:
             raise ImageError(
-                f"{path}: the mask is {mask.shape[::-1]} pixels, its upright image {shape[::-1]}"
+                f"{path}: the mask is {mask.shape[::-1]} pixels, its {self._orientation} image {shape[::-1]}"
             )
         return mask
 

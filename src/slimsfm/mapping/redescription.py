@@ -14,11 +14,12 @@ from jaxtyping import Float64, UInt8
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, ModelError
+from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.sift import Sift, root_sift
 from slimsfm.mapping.agreement import counted, positions
 from slimsfm.mapping.model import camera_of
-from slimsfm.photos import read_image
+from slimsfm.photos import Orientation, read_image
 from slimsfm.progress import ProgressBar
 
 _REACH_PX = 2.0
@@ -30,7 +31,7 @@ _RESIZED = 1.1  # a smaller change of size comes from undistortion, which is no 
 
 
 def redescribe(
-    images: list[pycolmap.Image], folder: Path, progress: ProgressBar
+    images: list[pycolmap.Image], folder: Path, progress: ProgressBar, orientation: Orientation = "stored"
 ) -> tuple[dict[str, Features], Sift, list[str]]:
     """Describe the keypoints of a model's images by SIFT.
 
@@ -47,7 +48,8 @@ def redescribe(
     extractor, features, scales = Sift(), {}, (0.0, np.inf)
     for image in progress(images, "describe keypoints"):
         path = folder / image.name
-        pixels, camera = read_image(path), camera_of(image)
+        pixels, camera = read_image(path, orientation), camera_of(image)
+        _check_turn(pixels, camera, path, orientation)
         scales = _common_scales(scales, pixels, camera, path)
         features[image.name] = _redescribe_image(image, _resized(pixels, camera), extractor)
     notes = [_check_shares(images, features, folder)]
@@ -57,6 +59,18 @@ def redescribe(
             "keypoints were scaled"
         )
     return features, extractor, notes
+
+
+def _check_turn(pixels: Image, camera: pycolmap.Camera, path: Path, orientation: Orientation) -> None:
+    """Check that a photo with an EXIF orientation lies like its image in the model."""
+    if pixels.shape[:2] == (camera.width, camera.height) != (camera.height, camera.width):
+        other = "upright" if orientation == "stored" else "stored"
+        if read_orientation(path) != 1:
+            raise ImageError(
+                f"{path}: {camera.height}x{camera.width} pixels, but its camera in the model has "
+                f"{camera.width}x{camera.height}; the model seems to be of its {other} pixels, so use "
+                f"`orientation={other!r}`"
+            )
 
 
 def _common_scales(
@@ -73,11 +87,8 @@ def _common_scales(
     low, high = max(low, scales[0]), min(high, scales[1])
     is_same = (low, high) == _SAME
     if low > high or (not is_same and high > 1 / _RESIZED and low < _RESIZED):
-        turned = (
-            " after the rotation in its EXIF data" if (height, width) == (camera.width, camera.height) else ""
-        )
         raise ImageError(
-            f"{path}: {width}x{height} pixels{turned}, but its camera in the model has "
+            f"{path}: {width}x{height} pixels, but its camera in the model has "
             f"{camera.width}x{camera.height} ({width / camera.width:.4g} times the width, "
             f"{height / camera.height:.4g} times the height); give the images that the model was made from, "
             "or all of them resized by one factor"

@@ -15,6 +15,7 @@ from slimsfm.features.store import FeatureFile, MatchFile, indistinct_names
 from slimsfm.mapping.agreement import counted
 from slimsfm.mapping.database import read_database
 from slimsfm.mapping.redescription import redescribe
+from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar
 
 
@@ -146,7 +147,9 @@ def _check_pairs(path: Path, found: MatchFile) -> tuple[str, ...]:
     return ()
 
 
-def from_images(images: list[pycolmap.Image], folder: Path, progress: ProgressBar) -> Source:
+def from_images(
+    images: list[pycolmap.Image], folder: Path, progress: ProgressBar, orientation: Orientation = "stored"
+) -> Source:
     """Compute SIFT descriptors at the model's keypoints.
 
     Raises:
@@ -155,7 +158,7 @@ def from_images(images: list[pycolmap.Image], folder: Path, progress: ProgressBa
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of images")
-    features, extractor, notes = redescribe(images, folder, progress)
+    features, extractor, notes = redescribe(images, folder, progress, orientation)
     return Source(
         path=folder,
         features=features,

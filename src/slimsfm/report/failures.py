@@ -213,7 +213,7 @@ def _frames(
     for i in shown:
         query = result.queries[i]
         try:
-            image = read_image(query.path)
+            image = read_image(query.path, query.orientation)
         except ImageError:
             continue
         yield QueryFrame(

@@ -17,7 +17,7 @@ from slimsfm.evaluation.results import Measurement, ObjectResult, Outcomes, Run,
 from slimsfm.evaluation.table import BY_FRAME, average_rows, rows_of
 from slimsfm.files import replacing
 from slimsfm.mapping.subset import keep_images
-from slimsfm.photos import read_image, shrink
+from slimsfm.photos import Orientation, read_image, shrink
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.report.figures import save_figure
 from slimsfm.report.formatting import format_error
@@ -33,7 +33,7 @@ from slimsfm.tracking.video import check_format, write_video
 FigureFormat = Literal["png", "svg", "pdf"]
 """File format of the figures that are not photos."""
 
-ReadPhoto = Callable[[Path], Image | None]
+ReadPhoto = Callable[[Path, Orientation], Image | None]
 """Reads a photo; None if it is missing or unreadable."""
 
 _EXPLANATIONS = {
@@ -116,9 +116,9 @@ class _Writer:
         path = self.add(place / f"{name or kind}.{self.format}", kind)
         save_figure(figure, path, overwrite=self.overwrite)
 
-    def read(self, path: Path) -> Image | None:
+    def read(self, path: Path, orientation: Orientation) -> Image | None:
         try:
-            return read_image(path)
+            return read_image(path, orientation)
         except ImageError as error:
             self.warnings.setdefault("photos", f"{error}; missing photos are left out")
             return None
@@ -140,7 +140,7 @@ def _write_method(writer: _Writer, maps: RunMaps) -> None:
     place = Path(result.name) / mapped.method
     reduced = keep_images(full, mapped.dominating_set)
     writer.save(before_after_figure(full, reduced), place, "before-after")
-    photos = {name: writer.read(result.images / name) for name in maps.graph.names}
+    photos = {name: writer.read(result.images / name, "upright") for name in maps.graph.names}
     thumbnails = {name: shrink(photo, _THUMBNAIL_PX) for name, photo in photos.items() if photo is not None}
     drawing = GraphDrawing(graph=maps.graph, threshold=maps.threshold, chosen=mapped.dominating_set)
     writer.save(graph_figure(drawing, thumbnails), place, "graph")
@@ -227,7 +227,7 @@ def draw_queries(result: ObjectResult, outcomes: Outcomes, read: ReadPhoto) -> I
     """Draw the queries of an object one by one, without those whose photo is missing."""
     names = _unique([query.path.stem for query in result.queries])
     for i, (query, name) in enumerate(zip(result.queries, names, strict=True)):
-        photo = read(query.path)
+        photo = read(query.path, query.orientation)
         if photo is None:
             continue
         verdict = format_error(outcomes.error[i])

@@ -205,7 +205,7 @@ def track_video(
         OutputError: The video cannot be written.
     """
     source, tracker = str(source), Tracker(localizer, options)
-    frames = open_frames(source)
+    frames = open_frames(source, localizer.map.info.orientation)
     rate = frames.frames_per_second
     with write_video(Path(video), rate, overwrite=overwrite) if video else nullcontext() as write:
         return _track_all(localizer, tracker, source, frames, camera, write, progress)

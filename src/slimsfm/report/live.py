@@ -22,7 +22,7 @@ from slimsfm.image_files import list_images
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.cameras import FocalLength, query_camera
 from slimsfm.mapping.map import Map
-from slimsfm.photos import read_image, shrink
+from slimsfm.photos import Orientation, read_image, shrink
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.report.live_panel import AFTER, BEFORE, MAX_PHOTO_PX, ViewerPanel
 from slimsfm.report.scene3d import Scene3D, build_scene3d
@@ -59,13 +59,13 @@ class LiveQueries:
         """Names of the images in the folder."""
         return list_images(self.folder)
 
-    def read(self, name: str) -> Image:
+    def read(self, name: str, orientation: Orientation = "upright") -> Image:
         """Read an image.
 
         Raises:
             ImageError: The image is missing or unreadable.
         """
-        return read_image(self.folder / name)
+        return read_image(self.folder / name, orientation)
 
 
 @contextmanager
@@ -189,9 +189,10 @@ class LiveView:
             Number of missing or unreadable photos; their frusta stay empty.
         """
         names = list(self.scene.frusta)
+        orientation = next(iter(self.maps.values())).map.info.orientation
         for name in progress(names, "photos"):
             try:
-                self.photos[name] = shrink(read_image(folder / name), MAX_PHOTO_PX)
+                self.photos[name] = shrink(read_image(folder / name, orientation), MAX_PHOTO_PX)
             except ImageError:
                 continue
             for viewer in list(self.viewers.values()):
@@ -211,7 +212,7 @@ class LiveView:
         assert self.queries is not None
         options = LocalizationOptions(focal=self.queries.focal)
         map_, path = self.maps[shown].map, self.queries.folder / name
-        image = self.queries.read(name)
+        image = self.queries.read(name, map_.info.orientation)
         camera = query_camera(map_, path, self.queries.camera, options.focal)
         if shown not in self._localizers:
             self._localizers[shown] = Localizer(map_, options)

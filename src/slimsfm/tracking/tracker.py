@@ -124,7 +124,7 @@ class Tracker:
         """Find the pose of the camera in the next frame.
 
         Args:
-            image: Upright RGB.
+            image: RGB, upright or as stored as the map says.
             camera: Intrinsics of the frame; by default those of the map, if all reference images share a
                 camera and the sizes agree up to a common scale.
 
@@ -151,6 +151,7 @@ class Tracker:
             if track:
                 self._background.restart(self._frame_index, track)
         self._track = track
+        localization = replace(localization, orientation=self._localizer.map.info.orientation)
         return Tracked(localization=self._smoothed(localization), state=state, seconds=perf_counter() - start)
 
     def _followed(self, frame: GrayFrame) -> Track | None:

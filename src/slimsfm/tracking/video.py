@@ -17,7 +17,7 @@ from slimsfm.arrays import Image
 from slimsfm.errors import InputError, OutputError
 from slimsfm.files import replacing
 from slimsfm.image_files import list_images
-from slimsfm.photos import read_image
+from slimsfm.photos import Orientation, read_image
 
 VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """Container formats of the videos that can be written, by suffix."""
@@ -34,7 +34,7 @@ class VideoFrame:
     """Index of the frame with six digits, or the name of its file."""
 
     image: Image
-    """Upright RGB."""
+    """RGB."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,8 +54,10 @@ class FrameSource:
     """Whether the frames come from a camera and continue until stopped."""
 
 
-def open_frames(source: str | Path) -> FrameSource:
+def open_frames(source: str | Path, orientation: Orientation = "upright") -> FrameSource:
     """Open a video file, a folder of images, or a camera by its index.
+
+    Images are read upright or as they are stored, as `orientation` says; videos are always upright.
 
     Raises:
         InputError: The file, folder or camera does not exist or contains no image.
@@ -64,16 +66,19 @@ def open_frames(source: str | Path) -> FrameSource:
     if path.is_dir():
         names = list_images(path)
         return FrameSource(
-            pictures=_images(path, names), count=len(names), frames_per_second=_DEFAULT_RATE, is_live=False
+            pictures=_images(path, names, orientation),
+            count=len(names),
+            frames_per_second=_DEFAULT_RATE,
+            is_live=False,
         )
     if source.isdigit() and not path.exists():
         return _open_camera(int(source))
     return _open_video(path)
 
 
-def _images(folder: Path, names: list[str]) -> Generator[VideoFrame]:
+def _images(folder: Path, names: list[str], orientation: Orientation) -> Generator[VideoFrame]:
     for name in names:
-        yield VideoFrame(name=name, image=read_image(folder / name))
+        yield VideoFrame(name=name, image=read_image(folder / name, orientation))
 
 
 def _open_camera(index: int) -> FrameSource:

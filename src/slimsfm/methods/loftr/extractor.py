@@ -23,7 +23,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import PairChoice, Pairs, exhaustive_pairs, sequential_pairs
 from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher, Photo
 from slimsfm.methods.loftr.mapping import build_without_keypoints
-from slimsfm.photos import read_photo
+from slimsfm.photos import Orientation, read_photo
 from slimsfm.weights import find_weights
 
 _CACHED = 32  # encoded reference photos kept in memory: 45 MB each at 640 x 480
@@ -180,7 +180,7 @@ class DetectorFree:
     def build_model(self, work: BuildWork, options: BuildOptions) -> MapParts:
         """Build a model from photos; see `slimsfm.mapping.build.ModelBuilder`."""
         chosen = replace(self, weights=_FOR_ONEPOSE) if find_weights(_FOR_ONEPOSE) else self
-        photos = PhotoFolder(work.images, work.names)
+        photos = PhotoFolder(work.images, work.names, options.orientation)
         poses = work.known.cam_from_world if work.known else None
         made = build_without_keypoints(
             photos,
@@ -218,14 +218,15 @@ def _masks(work: BuildWork) -> dict[str, GrayImage]:
 class PhotoFolder(Mapping[str, Photo]):
     """Photos of a folder by name, read on access."""
 
-    def __init__(self, folder: Path, names: list[str]) -> None:
+    def __init__(self, folder: Path, names: list[str], orientation: Orientation = "upright") -> None:
         self._folder = folder
+        self._orientation: Orientation = orientation
         self._names = dict.fromkeys(names)
 
     def __getitem__(self, name: str) -> Photo:
         if name not in self._names:
             raise KeyError(name)
-        return read_photo(self._folder / name, warn=False).image
+        return read_photo(self._folder / name, self._orientation, warn=False).image
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
