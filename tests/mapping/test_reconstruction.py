@@ -11,9 +11,11 @@ import pytest
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.features import Features
 from slimsfm.geometry import project
+from slimsfm.mapping.choice import CheckedModel, pick_model
 from slimsfm.mapping.pairs import verify_pairs
-from slimsfm.mapping.reconstruction import CheckedModel, pick_model, reconstruct
-from slimsfm.mapping.sfm import colmap_warnings, write_database
+from slimsfm.mapping.reconstruction import reconstruct
+from slimsfm.mapping.scratch import write_database
+from slimsfm.mapping.sfm import colmap_warnings
 from slimsfm.synthetic.scene import look_at
 
 SIZE, FOCAL = (640, 480), 560.0

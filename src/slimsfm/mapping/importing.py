@@ -28,7 +28,7 @@ from slimsfm.mapping.sources import (
     from_images,
 )
 from slimsfm.mapping.support import measure
-from slimsfm.mapping.usable_matches import usable_matches
+from slimsfm.mapping.usable_matches import evidence, usable_matches
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar, silent
 
@@ -118,7 +118,7 @@ def import_colmap(
         box=given_box or estimate_box(model),
         box_source="given" if given_box else "estimated",
         origin=f"imported COLMAP model with descriptors from {source.origin}",
-        quality=_quality(model, matches) if matches else None,
+        quality=_quality(model, evidence(source, posed, features, matches)) if matches else None,
         notes=(*notes, *source.notes, *more, *left_out),
         orientation=options.orientation,
         exif_orientations=_tags(model, options),

@@ -13,7 +13,7 @@ import pycolmap
 
 from slimsfm.features import Features, shrink_factor
 from slimsfm.geometry import resized_camera
-from slimsfm.mapping.sfm import put_keypoints
+from slimsfm.mapping.scratch import put_keypoints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,6 +60,8 @@ class ShrunkImages:
         names = {self.whole_cameras[name].camera_id: name for name in self.factors}
         names |= {image.camera_id: image.name for image in model.images.values()}
         for camera_id, camera in model.cameras.items():
+            if camera_id not in names:
+                continue  # of no image in the model
             name = names[camera_id]
             whole, factor = self.whole_cameras[name], self.factors[name]
             enlarged = whole if known_cameras else resized_camera(camera, factor)

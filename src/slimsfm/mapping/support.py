@@ -129,7 +129,11 @@ def trusted_pairs(matches: Matches, names: Iterable[str]) -> set[Pair]:
     trusted: set[Pair] = set()
     for pairs in of_image.values():
         strongest = max(pairs, key=count.__getitem__)
-        near = [p for p in pairs if p in neighbors and count[p] >= _NEIGHBOR_SHARE * count[strongest]]
+        near = [
+            p
+            for p in pairs
+            if tuple(sorted(p)) in neighbors and count[p] >= _NEIGHBOR_SHARE * count[strongest]
+        ]
         trusted.update(near or [strongest])
     return trusted
 

@@ -13,6 +13,7 @@ from slimsfm.mapping.agreement import Masks
 from slimsfm.mapping.model import camera_of
 from slimsfm.mapping.pairs import Matches
 from slimsfm.mapping.sources import Source
+from slimsfm.mapping.support import trusted_pairs
 
 _MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
 _MAX_EPIPOLAR_ERROR_PX = 4.0  # in pixels in which features were found
@@ -51,6 +52,33 @@ def usable_matches(
         if len(pairs):
             found[a, b] = pairs
     return found, _notes(source, found)
+
+
+def evidence(
+    source: Source, images: list[pycolmap.Image], features: Mapping[str, Features], usable: Matches
+) -> Matches:
+    """The matches to check a model by.
+
+    Unverified matches were filtered by the poses of the model, so they cannot contradict it. Those of trusted
+    pairs pass two-view geometry instead.
+    """
+    if not source.unverified:
+        return usable
+    by_name = {image.name: image for image in images if image.num_points2D()}
+    raw = {pair: source.matches[pair] for pair in source.matches if by_name.keys() >= set(pair)}
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    checked = dict(usable)
+    for a, b in sorted(trusted_pairs(raw, by_name)):
+        points = [features[name].keypoints.astype(np.float64) for name in (a, b)]
+        cameras = [camera_of(by_name[name]) for name in (a, b)]
+        geometry = pycolmap.estimate_two_view_geometry(
+            cameras[0], points[0], cameras[1], points[1], raw[a, b].astype(np.uint32), options
+        )
+        inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+        if len(inliers) >= _MIN_INLIERS:
+            checked[a, b] = inliers
+    return checked
 
 
 def _notes(source: Source, found: Matches) -> list[str]:

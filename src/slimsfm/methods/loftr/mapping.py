@@ -17,10 +17,12 @@ from jaxtyping import Float64, Int64
 
 from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
+from slimsfm.mapping.choice import pick_model
 from slimsfm.mapping.extraction import color_points
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
-from slimsfm.mapping.reconstruction import pick_model, reconstruct
-from slimsfm.mapping.sfm import adjust, triangulate, verified_matches, write_database
+from slimsfm.mapping.reconstruction import reconstruct
+from slimsfm.mapping.scratch import verified_matches, write_database
+from slimsfm.mapping.sfm import adjust, triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.methods.loftr.cells import (
     CellKeypoints,

@@ -1,0 +1,144 @@
+"""Models with their support, and which of them is taken."""
+
+from dataclasses import dataclass
+
+import pycolmap
+
+from slimsfm.errors import InputError, ReconstructionError
+from slimsfm.mapping.quality import ModelQuality
+
+_LEAST = 0.1  # share of the photos that a model should contain
+_SMALLEST_OTHER = 5  # images of models after the first
+_MORE = 1.01  # times the observations with which several cameras explain the photos better than one
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CheckedModel:
+    """A model and what supports it."""
+
+    model: pycolmap.Reconstruction
+    """The model; images have their names."""
+
+    quality: ModelQuality
+    """Its support."""
+
+    way: str = ""
+    """How it was mapped, if not incrementally from all pairs."""
+
+    split: tuple[str, ...] = ()
+    """Photos that got another camera than the others, because their focal length differs."""
+
+    @property
+    def is_right(self) -> bool:
+        """Whether nothing contradicts the model."""
+        return not self.quality.faults and not self.quality.contradictions
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of the images of the model, sorted."""
+        return tuple(sorted(self.model.image(i).name for i in self.model.reg_image_ids()))
+
+
+Attempt = list[CheckedModel]
+"""The models of one way to map, best first."""
+
+
+def rank(checked: CheckedModel) -> tuple:
+    """Sort key: the larger, the better."""
+    quality = checked.quality
+    return (
+        not quality.faults,
+        _is_large(checked),
+        -len(quality.contradictions),
+        quality.registered,
+        quality.median_observations,
+    )
+
+
+def explains_more(candidate: CheckedModel, first: CheckedModel) -> bool:
+    """Whether a model has as many images as another, and fewer contradictions or more observations."""
+    fewer = len(candidate.quality.contradictions) < len(first.quality.contradictions)
+    observations = [one.model.compute_num_observations() for one in (candidate, first)]
+    return candidate.quality.registered >= first.quality.registered and (
+        fewer or observations[0] > _MORE * observations[1]
+    )
+
+
+def registered(attempt: Attempt) -> int:
+    """Number of images in the right models of an attempt, without the smallest."""
+    large = [checked for checked in attempt if checked.is_right and _is_large(checked)]
+    return len({name for checked in large for name in checked.images})
+
+
+def _is_large(checked: CheckedModel) -> bool:
+    return checked.quality.registered >= _LEAST * checked.quality.given
+
+
+def reached(attempt: Attempt) -> int:
+    """Number of images in any model of an attempt."""
+    return len({name for checked in attempt for name in checked.images})
+
+
+def best(attempts: list[Attempt]) -> list[CheckedModel]:
+    """The right models of the attempt that registers most images, or the least contradicted model.
+
+    Raises:
+        ReconstructionError: All models have faults.
+    """
+    attempt = max(attempts, key=registered)
+    if registered(attempt):
+        return _apart([checked for checked in attempt if checked.is_right])
+    usable = [checked for attempt in attempts for checked in attempt if not checked.quality.faults]
+    if not usable:
+        raise ReconstructionError(_faults(attempts))
+    usable = [checked for checked in usable if _is_large(checked)] or usable
+    return [
+        min(usable, key=lambda checked: (checked.quality.contradicted_share, -checked.quality.registered))
+    ]
+
+
+def _apart(models: list[CheckedModel]) -> list[CheckedModel]:
+    """Models most of whose images are not in a larger one."""
+    kept: list[CheckedModel] = []
+    used: set[str] = set()
+    for checked in sorted(models, key=lambda checked: -checked.quality.registered):
+        new = len(set(checked.images) - used)
+        if not kept or (new >= _SMALLEST_OTHER and 2 * new > len(checked.images)):
+            kept.append(checked)
+            used.update(checked.images)
+    return kept
+
+
+def _faults(attempts: list[Attempt]) -> str:
+    """What is wrong with the largest model, or the reason that there is none."""
+    models = [checked for attempt in attempts for checked in attempt]
+    if not models:
+        return "no three photos could be joined"
+    return "; ".join(max(models, key=lambda one: one.quality.registered).quality.faults)
+
+
+def pick_model(models: list[CheckedModel], number: int) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """The model with a number, from 1, and notes on how it was mapped and on the other models.
+
+    Raises:
+        InputError: There are not that many models.
+    """
+    if number > len(models):
+        sizes = ", ".join(str(one.quality.registered) for one in models)
+        raise InputError(
+            f"model must be at most {len(models)}, got {number}: these photos give models of {sizes} images"
+        )
+    picked = models[number - 1]
+    notes = [f"the photos were mapped {picked.way}"] if picked.way else []
+    if picked.split:
+        notes.append(
+            f"{len(picked.split)} photos have another focal length than others of their camera, and got "
+            f"another camera: {', '.join(picked.split)}"
+        )
+    for other, checked in enumerate(models, start=1):
+        if other != number:
+            notes.append(
+                f"{checked.quality.registered} photos form another model, which `model={other}` keeps: "
+                f"{', '.join(checked.images)}"
+            )
+    return picked.model, tuple(notes)

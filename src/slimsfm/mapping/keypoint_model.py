@@ -1,0 +1,76 @@
+"""Build a model from keypoints: extract, match, reconstruct."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pycolmap
+
+from slimsfm.errors import ReconstructionError
+from slimsfm.features import Extractor, Features, load_matcher
+from slimsfm.mapping.choice import pick_model
+from slimsfm.mapping.diagnosis import diagnose
+from slimsfm.mapping.extraction import color_points, extract_features
+from slimsfm.mapping.orientation import TurnedFeatures, turned_model
+from slimsfm.mapping.pairs import choose_pairs, match_pairs_with, verify_pairs
+from slimsfm.mapping.reconstruction import reconstruct
+from slimsfm.mapping.scratch import match_pairs, put_keypoints, verified_matches, write_database
+from slimsfm.mapping.sfm import triangulate
+from slimsfm.mapping.shrinking import ShrunkImages
+from slimsfm.mapping.work import BuildOptions, BuildWork, MapParts
+
+
+def build_from_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
+    """Extract and match keypoints, and reconstruct a model of them.
+
+    Raises:
+        InputError: A photo, a mask or an option cannot be used.
+        ReconstructionError: The images give no model; says what they lack.
+    """
+    output, names = work.workspace / "features.h5", work.names
+    features, colors = extract_features(work.photos, names, extractor, output, work.progress)
+    sideways = TurnedFeatures(features, dict.fromkeys(work.turned, 1))
+    shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
+    database = _match(work, features, shrunk, options)
+    model, notes = _reconstruct(work, database, shrunk, options)
+    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
+    shrunk.enlarge(model, known_cameras=work.known is not None)
+    if work.turned:
+        turns_back = {image.name: -int(image.name in work.turned) for image in model.images.values()}
+        model = turned_model(model, turns_back)
+        put_keypoints(model, features)
+    color_points(model, colors)
+    return MapParts(extractor=extractor, model=model, features=features, matches=matches, notes=notes)
+
+
+def _reconstruct(
+    work: BuildWork, database: Path, shrunk: ShrunkImages, options: BuildOptions
+) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
+    """The model, and notes on how it was chosen."""
+    names, sfm, seed = work.names, work.workspace / "sfm", options.seed
+    if work.known:
+        poses = work.known.cam_from_world
+        return triangulate(database, names, sfm, poses, seed=seed, progress=work.progress), ()
+    try:
+        models = reconstruct(database, names, sfm, seed=seed, progress=work.progress)
+    except ReconstructionError as error:
+        matches = verified_matches(database, dict(enumerate(names, start=1)))
+        reasons = [str(error), diagnose(work.images, names, shrunk.features, matches)]
+        raise ReconstructionError(
+            f"{work.images}: these {len(names)} photos give no model: {'; '.join(filter(None, reasons))}"
+        ) from error
+    return pick_model(models, options.model)
+
+
+def _match(
+    work: BuildWork, features: Mapping[str, Features], shrunk: ShrunkImages, options: BuildOptions
+) -> Path:
+    database = work.workspace / "database.db"
+    write_database(database, shrunk.features, shrunk.cameras)
+    names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
+    if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
+        match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)
+    else:
+        matcher = load_matcher(options.matcher, options.extractor)
+        matches = match_pairs_with(matcher, features, pairs, work.progress)
+        verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
+    return database

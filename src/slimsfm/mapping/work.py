@@ -1,0 +1,153 @@
+"""What a model is built from, and what building it gives."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import pycolmap
+
+from slimsfm.arrays import Image
+from slimsfm.features import Extractor, Features
+from slimsfm.geometry import Box
+from slimsfm.mapping.extraction import CameraSharing
+from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
+from slimsfm.mapping.pairs import Matches, PairChoice
+from slimsfm.photos import Orientation
+from slimsfm.progress import ProgressBar
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildOptions:
+    """How a map is built from photos."""
+
+    camera: CameraSharing = "auto"
+    """Images that share a camera: all (shared), none (per-image), or images of equal size and, by EXIF, equal
+    focal length and device (auto). Width and height may be swapped."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the photos to map: turned upright according to EXIF, or as they are stored, as COLMAP
+    does. Queries are read alike."""
+
+    pairs: PairChoice = "auto"
+    """Pairs of images to match: all (exhaustive), neighbors in order of name (sequential), or images that
+    look alike (similar). auto: exhaustive up to 200 images, otherwise sequential and similar; without a
+    detector, exhaustive up to 30 images, otherwise by pose if poses are known, else sequential."""
+
+    masks: Path | None = None
+    """Folder of masks, IMG.jpg.png or IMG.png for image IMG.jpg as in COLMAP; where a mask is black, no
+    features are used."""
+
+    alpha: AlphaUse = "mask"
+    """What transparency does: transparent pixels hold no features (mask), or are like any others (ignore)."""
+
+    extractor: str = "sift"
+    """Local features, see `slimsfm methods`; loftr matches images without a detector."""
+
+    matcher: str = "nearest"
+    """Matcher of the features: nearest, lightglue or superglue."""
+
+    max_image_size: int | None = None
+    """Longer side in pixels to which larger images are shrunk before extraction. Default: 1600 for SIFT, 1024
+    for learned features, 640 for loftr."""
+
+    max_features: int | None = None
+    """Largest number of features per image. Default: 4096 for SIFT, 2048 for learned features."""
+
+    box: Path | None = None
+    """File with the object's box: JSON or OnePose's box3d_corners.txt. Estimated by default."""
+
+    model: int = 1
+    """Which model to keep if the photos give several: 1 is the largest."""
+
+    seed: int = 0
+    """Seed of every random choice."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+        if self.model < 1:
+            raise ValueError(f"model must be at least 1, got {self.model}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownPoses:
+    """Known cameras and poses of images; none of them is refined."""
+
+    cameras: Mapping[str, pycolmap.Camera]
+    """Intrinsics by image name; images with equal `camera_id` share a camera."""
+
+    cam_from_world: Mapping[str, pycolmap.Rigid3d]
+    """Poses by image name."""
+
+    box: Box
+    """The object's box in the world frame."""
+
+    unit: str
+    """Unit of the world frame, such as "metre"."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BuildWork:
+    """What a model is built from."""
+
+    images: Path
+    """Folder of the photos."""
+
+    photos: MaskedPhotos
+    """The photos with their masks."""
+
+    names: list[str]
+    """Names of the photos to use, relative to the folder."""
+
+    workspace: Path
+    """Folder for intermediate files."""
+
+    cameras: Mapping[str, pycolmap.Camera]
+    """Intrinsics by image name; images with equal `camera_id` share a camera."""
+
+    turned: Mapping[str, pycolmap.Camera]
+    """Images taken with the camera of others, held turned by 90°: the camera of the others."""
+
+    known: KnownPoses | None
+    """Known poses, if any: then points are triangulated and nothing else is estimated."""
+
+    progress: ProgressBar
+    """Progress callback."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapParts:
+    """A model and the data that its map stores with it."""
+
+    extractor: Extractor
+    """Extractor that the map records for queries."""
+
+    model: pycolmap.Reconstruction
+    """The SfM model; keypoint i of an image is row i of its features."""
+
+    features: Mapping[str, Features]
+    """Local features by image name."""
+
+    matches: Matches
+    """Verified matches by pair of image names."""
+
+    notes: tuple[str, ...] = ()
+    """What the user should know about the choice of the model."""
+
+    photos: Mapping[str, Image] = field(default_factory=dict)
+    """Small photos by image name, for extractors without keypoints."""
+
+
+@runtime_checkable
+class ModelBuilder(Protocol):
+    """An extractor that builds the model of a map itself, because it finds no keypoints."""
+
+    def build_model(self, work: BuildWork, options: BuildOptions) -> MapParts:
+        """Build a model from photos.
+
+        Raises:
+            InputError: A photo, a mask or an option cannot be used.
+            ReconstructionError: The images give no model.
+        """
+        ...
