@@ -22,8 +22,8 @@ from hard_photos import MAKERS
 from lookalikes import LOOKALIKES
 from slimsfm.cli.output import quiet
 from slimsfm.errors import SlimsfmError
+from slimsfm.image_files import list_images
 from slimsfm.mapping import Map, build_map
-from slimsfm.photos import list_images
 from slimsfm.progress import shown
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 0
