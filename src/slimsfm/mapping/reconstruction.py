@@ -43,9 +43,23 @@ _SMALLEST = 3  # images of a model
 
 
 def reconstruct(
-    database: Path, names: list[str], workspace: Path, *, seed: int, progress: ProgressBar = silent
+    database: Path,
+    names: list[str],
+    workspace: Path,
+    *,
+    seed: int,
+    split: bool = True,
+    progress: ProgressBar = silent,
 ) -> list[CheckedModel]:
     """Reconstruct the images of a database.
+
+    Args:
+        database: Images, numbered from 1, with features and verified matches.
+        names: Their names.
+        workspace: Folder for intermediate files.
+        seed: Seed of every random choice.
+        split: Give photos of one camera several cameras if their focal lengths differ.
+        progress: Progress callback.
 
     Returns:
         The right models, which hardly have images in common, largest first. If all are contradicted, the
@@ -55,17 +69,24 @@ def reconstruct(
         ReconstructionError: No model is in one piece, with parallax and possible focal lengths.
     """
     workspace.mkdir(parents=True, exist_ok=True)
-    return _Search(database, names, workspace, seed, progress).run()
+    return _Search(database, names, workspace, seed, split, progress).run()
 
 
 class _Search:
     """Maps the images of a database in one way after the other until a model is right."""
 
     def __init__(
-        self, database: Path, names: list[str], workspace: Path, seed: int, progress: ProgressBar
+        self,
+        database: Path,
+        names: list[str],
+        workspace: Path,
+        seed: int,
+        may_split: bool,
+        progress: ProgressBar,
     ) -> None:
         self._database, self._names, self._workspace = database, names, workspace
-        self._seed, self._progress, self._split = seed, progress, ()
+        self._seed, self._progress = seed, progress
+        self._may_split, self._split = may_split, ()
         self._ids = {name: image_id for image_id, name in enumerate(names, start=1)}
         self._matches = verified_matches(database, {i: name for name, i in self._ids.items()})
 
@@ -101,7 +122,7 @@ class _Search:
 
     def _with_right_cameras(self, first: Attempt) -> Attempt:
         """Another attempt with more cameras, if photos that share one have several focal lengths."""
-        if not first or not has_several_focal_lengths(first[0].model):
+        if not self._may_split or not first or not has_several_focal_lengths(first[0].model):
             return first
         shared = self._cameras
         own = {image_id: own_camera(camera, image_id) for image_id, camera in shared.items()}
