@@ -51,7 +51,8 @@ class ModelQuality:
     """Share of the pairs whose matches a rotation of the camera explains; measured if cameras are close."""
 
     focal_lengths: dict[str, float] = field(default_factory=dict)
-    """Focal length over the longer side, by the name of the first image of each camera."""
+    """Focal length over the longer side, by the name of the first image of each camera; of many cameras, a
+    dozen from the shortest to the longest."""
 
     focal_origins: dict[str, str] = field(default_factory=dict)
     """First guess of these focal lengths: "EXIF", "guessed", "given" (known) or "model" (imported)."""

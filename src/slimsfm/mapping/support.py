@@ -39,6 +39,7 @@ MIN_AGREEING = 0.5
 _MAX_ERROR_PX, _FULL_SIZE = 4.0, 1600  # from an epipolar line; in larger images in proportion
 _NEIGHBOR_SHARE = 0.5  # of the matches of the strongest pair that a neighbor needs to be trusted
 _CLOSE = 0.3  # camera spread up to which cameras may only have turned
+_LISTED_CAMERAS = 12  # whose focal lengths are kept, from the shortest to the longest
 _SAMPLED = 2000  # points whose triangulation angle is measured
 
 
@@ -205,4 +206,8 @@ def _focal_lengths(images: Mapping[str, pycolmap.Image]) -> dict[str, float]:
     for name in sorted(images):
         first.setdefault(images[name].camera_id, name)
     cameras = {name: camera_of(images[name]) for name in first.values()}
-    return {name: c.mean_focal_length() / max(c.width, c.height) for name, c in cameras.items()}
+    found = {name: c.mean_focal_length() / max(c.width, c.height) for name, c in cameras.items()}
+    by_length = sorted(found, key=lambda name: (found[name], name))
+    places = np.linspace(0, len(found) - 1, min(len(found), _LISTED_CAMERAS)).round().astype(int)
+    listed = {by_length[place] for place in places.tolist()}
+    return {name: found[name] for name in sorted(listed)}
