@@ -194,7 +194,7 @@ def test_images_without_anything_in_common_are_a_reconstruction_error(tmp_path):
         noise = np.random.default_rng(seed).integers(0, 256, (60, 80, 3)).astype(np.uint8)
         Image.fromarray(noise).save(folder / f"{seed}.png")
     with pytest.raises(
-        ReconstructionError, match=r"these 3 photos give no model.*3 of 3 photos are without verified"
+        ReconstructionError, match=r"these 3 photos give no model.*3 of 3 photos are almost without texture"
     ):
         build_map(folder)
 

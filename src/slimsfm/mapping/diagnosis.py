@@ -1,6 +1,6 @@
 """Why photos give no model: what they lack, measured."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -32,26 +32,23 @@ def diagnose(images: Path, names: list[str], features: Mapping[str, Features], m
         Sentences with numbers and names, joined by semicolons; empty if the photos lack nothing of this.
     """
     grays = {name: _gray(images / name) for name in names}
-    faults = [
-        _listed("almost black", (n for n, g in grays.items() if g.mean() < _DARK), names, "use more light"),
-        _listed("overexposed", (n for n, g in grays.items() if g.mean() > _BRIGHT), names, "use less light"),
-        _listed("blurred", (n for n in names if _is_blurred(grays[n])), names, "hold the camera still"),
-        _listed(
-            f"almost without texture (fewer than {_FEW} features)",
-            (n for n in names if len(features[n]) < _FEW),
-            names,
-            "go closer, or add something with texture to the scene",
-        ),
+    few = f"almost without texture (fewer than {_FEW} features)"
+    alone = sorted(set(names) - {name for pair in matches for name in pair})
+    causes = [
+        _listed("almost black", [n for n, g in grays.items() if g.mean() < _DARK], names, "use more light"),
+        _listed("overexposed", [n for n, g in grays.items() if g.mean() > _BRIGHT], names, "use less light"),
+        _listed("blurred", [n for n in names if _is_blurred(grays[n])], names, "hold the camera still"),
         _listed("equal to another photo", _repeated(grays), names, "move between photos"),
-        _listed(
-            "without verified matches to any other photo",
-            sorted(set(names) - {name for pair in matches for name in pair}),
-            names,
-            "take more photos between these, so that neighbors share most of what they show",
-        ),
-        _still(features, matches),
     ]
-    return "; ".join(fault for fault in faults if fault)
+    effects = [
+        _listed(few, [n for n in names if len(features[n]) < _FEW], names, "go closer, or add some texture"),
+        _still(features, matches),
+        _listed(
+            "without verified matches to any other photo", alone, names, "take more photos between these"
+        ),
+    ]
+    found = [fault for fault in causes if fault]
+    return "; ".join(found or [fault for fault in effects if fault])
 
 
 def _gray(path: Path) -> np.ndarray:
@@ -67,8 +64,7 @@ def _repeated(grays: Mapping[str, np.ndarray]) -> list[str]:
     return [name for name, gray in grays.items() if first.setdefault(gray.tobytes(), name) != name]
 
 
-def _listed(what: str, found: Iterable[str], names: list[str], advice: str) -> str:
-    affected = list(found)
+def _listed(what: str, affected: list[str], names: list[str], advice: str) -> str:
     if len(affected) < max(1, _COMMON * len(names)):
         return ""
     more = f" and {len(affected) - _LISTED} more" if len(affected) > _LISTED else ""
