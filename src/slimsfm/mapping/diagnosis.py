@@ -56,7 +56,8 @@ def _gray(path: Path) -> np.ndarray:
 
 
 def _is_blurred(gray: np.ndarray) -> bool:
-    return gray.mean() >= _DARK and float(cv2.Laplacian(gray, cv2.CV_64F).var()) < _SHARP
+    sharpness = float(cv2.Laplacian(gray, cv2.CV_64F).var())
+    return bool(gray.mean() >= _DARK) and sharpness < _SHARP
 
 
 def _repeated(grays: Mapping[str, np.ndarray]) -> list[str]:
