@@ -83,18 +83,16 @@ def best(attempts: list[Attempt]) -> list[CheckedModel]:
     """The right models of the attempt that registers most images, or the least contradicted model.
 
     Raises:
-        ReconstructionError: All models have faults.
+        ReconstructionError: All models have faults or hardly any images.
     """
     attempt = max(attempts, key=registered)
     if registered(attempt):
         return _apart([checked for checked in attempt if checked.is_right])
     usable = [checked for attempt in attempts for checked in attempt if not checked.quality.faults]
-    if not usable:
+    large = [checked for checked in usable if _is_large(checked)]
+    if not large:
         raise ReconstructionError(_faults(attempts))
-    usable = [checked for checked in usable if _is_large(checked)] or usable
-    return [
-        min(usable, key=lambda checked: (checked.quality.contradicted_share, -checked.quality.registered))
-    ]
+    return [min(large, key=lambda one: (one.quality.contradicted_share, -one.quality.registered))]
 
 
 def _apart(models: list[CheckedModel]) -> list[CheckedModel]:
@@ -114,7 +112,9 @@ def _faults(attempts: list[Attempt]) -> str:
     models = [checked for attempt in attempts for checked in attempt]
     if not models:
         return "no three photos could be joined"
-    return "; ".join(max(models, key=lambda one: one.quality.registered).quality.faults)
+    quality = max(models, key=lambda one: one.quality.registered).quality
+    small = f"the largest model has only {quality.registered} of {quality.given} photos"
+    return "; ".join(quality.faults) or small
 
 
 def pick_model(models: list[CheckedModel], number: int) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:

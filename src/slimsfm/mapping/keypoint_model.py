@@ -18,6 +18,8 @@ from slimsfm.mapping.sfm import triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.work import BuildOptions, BuildWork, MapParts
 
+_FEW = 0.5  # share of the photos below which a map needs an explanation
+
 
 def build_from_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
     """Extract and match keypoints, and reconstruct a model of them.
@@ -50,16 +52,25 @@ def _reconstruct(
     if work.known:
         poses = work.known.cam_from_world
         return triangulate(database, names, sfm, poses, seed=seed, progress=work.progress), ()
+    split = options.camera == "auto"  # otherwise the user knows
     try:
-        split = options.camera == "auto"  # otherwise the user knows
         models = reconstruct(database, names, sfm, seed=seed, split=split, progress=work.progress)
     except ReconstructionError as error:
-        matches = verified_matches(database, dict(enumerate(names, start=1)))
-        reasons = [str(error), diagnose(work.images, names, shrunk.features, matches)]
+        reasons = filter(None, [str(error), _lacking(work, database, shrunk)])
         raise ReconstructionError(
-            f"{work.images}: these {len(names)} photos give no model: {'; '.join(filter(None, reasons))}"
+            f"{work.images}: these {len(names)} photos give no model: {'; '.join(reasons)}"
         ) from error
-    return pick_model(models, options.model)
+    model, notes = pick_model(models, options.model)
+    if model.num_reg_images() < _FEW * len(names):
+        few = f"the map has only {model.num_reg_images()} of {len(names)} photos"
+        notes = ("; ".join(filter(None, [few, _lacking(work, database, shrunk)])), *notes)
+    return model, notes
+
+
+def _lacking(work: BuildWork, database: Path, shrunk: ShrunkImages) -> str:
+    """What the photos lack for a model of all of them."""
+    matches = verified_matches(database, dict(enumerate(work.names, start=1)))
+    return diagnose(work.images, work.names, shrunk.features, matches)
 
 
 def _match(
