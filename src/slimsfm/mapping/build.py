@@ -113,6 +113,8 @@ def _map(
 ) -> Map:
     """The map of a model, without global descriptors."""
     quality, names = measure(parts.model, parts.matches, work.names), work.names
+    if work.known:  # a known pose is believed more than look-alike matches
+        quality = replace(quality, contradictions={}, doubtful=())
     registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     info = MapInfo(
         extractor=parts.extractor.name,
