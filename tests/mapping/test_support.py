@@ -78,7 +78,8 @@ def test_images_without_common_points_are_pieces_of_which_the_largest_is_kept():
     quality = measure(model, {}, ["001.png"])
     assert quality.pieces == (5, 1, 1)
     assert any("fall into 3 pieces" in fault for fault in quality.faults)
-    assert any("cannot be trusted: its images fall into 3 pieces" in text for text in quality.warnings)
+    assert any("may be wrong: its images fall into 3 pieces" in text for text in quality.warnings)
+    assert replace(quality, focal_origins={"001.png": "given"}).warnings == ()
     kept = largest_piece(model)
     assert kept.num_reg_images() == 5
     assert measure(kept, {}, ["001.png"]).pieces == (5,)

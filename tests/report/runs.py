@@ -1,7 +1,7 @@
 """A benchmark run of exact scenes, measured like the command does, in a second."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -82,7 +82,10 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
                 dominating_set=chosen,
                 lower_bound=int(solution.lower_bound),
                 dominating_points=len(stored["dominating"][0].point3D_ids),
-                quality=measure(truth.model, with_matches(truth).matches, truth.images),
+                quality=replace(
+                    measure(truth.model, with_matches(truth).matches, truth.images),
+                    focal_origins={names[0]: "given"},
+                ),
                 notes=("a <raw> photo was skipped",),
             ),
         ),

@@ -19,7 +19,8 @@ def doubted(result: ObjectResult) -> ObjectResult:
     """The object with a map that its matches contradict."""
     (mapped,) = result.maps
     assert mapped.quality is not None
-    quality = replace(mapped.quality, contradictions=CONTRADICTIONS, focal_origins={"001.png": "EXIF"})
+    origins, pieces = {"001.png": "EXIF"}, (mapped.references,)
+    quality = replace(mapped.quality, contradictions=CONTRADICTIONS, focal_origins=origins, pieces=pieces)
     return replace(result, maps=(replace(mapped, quality=quality),))
 
 
@@ -55,7 +56,7 @@ def test_each_object_says_what_supports_its_map(html, run):
 
 def test_contradicted_images_are_listed_with_the_share_of_matches_that_agrees(in_doubt):
     shown = support_html(in_doubt.objects[1].maps[0])
-    assert "&lt;004&gt;.png (5% of its matches agree), 003.png (30% of its matches agree)" in shown
+    assert "&lt;004&gt;.png (5%), 003.png (30%): share of the matches" in shown
     assert re.search(r"\d\.\d\d \(EXIF, first image 001\.png\)", shown)
 
 

@@ -114,8 +114,9 @@ class ModelQuality:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts, and faults: those of models that were imported, or of known poses."""
-        return (*self.doubts, *(f"the model cannot be trusted: {fault}" for fault in self.faults))
+        """Doubts, and the faults that an imported model may have. Known poses do not depend on points."""
+        faults = () if "given" in self.focal_origins.values() else self.faults
+        return (*self.doubts, *(f"the model may be wrong: {fault}" for fault in faults))
 
 
 def quality_from_json(data: dict[str, Any] | None) -> ModelQuality | None:

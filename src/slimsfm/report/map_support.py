@@ -35,7 +35,6 @@ def support_html(mapped: MappedObject) -> str:
 
 def _facts(quality: ModelQuality) -> dict[str, str]:
     agreeing = quality.verified_pairs - quality.contradicted_pairs
-    contradicted = [f"{name} ({share:.0%} of its matches agree)" for name, share in _contradicted(quality)]
     focal_lengths = [
         f"{focal:.2f} ({quality.focal_origins.get(name, 'refined')}, first image {name})"
         for name, focal in quality.focal_lengths.items()
@@ -43,7 +42,7 @@ def _facts(quality: ModelQuality) -> dict[str, str]:
     return {
         "Photos": f"{quality.registered} of {quality.given} registered",
         "Verified pairs": f"{agreeing} of {quality.verified_pairs} agree with the model",
-        "Contradicted images": ", ".join(contradicted)
+        "Contradicted images": _contradicted(quality)
         or f"none; {quality.trusted_pairs} pairs are trusted to tell",
         "Observations": f"median of {quality.median_observations:.0f} points per image, "
         f"{quality.median_track_length:.1f} images per point",
@@ -52,6 +51,8 @@ def _facts(quality: ModelQuality) -> dict[str, str]:
     }
 
 
-def _contradicted(quality: ModelQuality) -> list[tuple[str, float]]:
-    """The contradicted images, the least supported first."""
-    return sorted(quality.contradictions.items(), key=lambda one: (one[1], one[0]))
+def _contradicted(quality: ModelQuality) -> str:
+    """The contradicted images, the least supported first; empty if there are none."""
+    found = sorted(quality.contradictions.items(), key=lambda one: (one[1], one[0]))
+    listed = ", ".join(f"{name} ({share:.0%})" for name, share in found)
+    return listed and f"{listed}: share of the matches that agree, in the worst trusted pair of the image"
