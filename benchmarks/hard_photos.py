@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from slimsfm.arrays import Image
-from slimsfm.photos import list_images, read_image
+from slimsfm.image_files import list_images
+from slimsfm.photos import read_image
 
 Named = Iterable[tuple[str, Image]]
 _EVERY = 2  # photos of a set: half of them make a set as people take it

@@ -22,8 +22,8 @@ from hard_photos import MAKERS
 from lookalikes import LOOKALIKES
 from slimsfm.cli.output import quiet
 from slimsfm.errors import SlimsfmError
+from slimsfm.image_files import list_images
 from slimsfm.mapping import Map, build_map
-from slimsfm.photos import list_images
 from slimsfm.progress import shown
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 0
@@ -33,8 +33,11 @@ Rotations = dict[str, pycolmap.Rotation3d]
 """Rotation from the world to the camera, by image name without its suffix."""
 
 
-def scenes(output: Path, photos: Path | None, other: Path | None) -> Iterator[tuple[str, Path, Rotations]]:
+def scenes(
+    output: Path, photos: Path | None, other: Path | None, more: list[Path]
+) -> Iterator[tuple[str, Path, Rotations]]:
     """Name, folder of images and true rotations of each scene; empty if unknown."""
+    yield from ((folder.name, folder, {}) for folder in more)
     for name in LOOKALIKES:
         yield name, *_rendered(output / name, name)
     if photos is None or other is None:
@@ -127,12 +130,13 @@ def main() -> None:
     parser.add_argument("-o", "--output", required=True, type=Path)
     parser.add_argument("--photos", type=Path, help="photos of one place")
     parser.add_argument("--other", type=Path, help="photos of another place")
+    parser.add_argument("--more", type=Path, nargs="*", default=[], help="further folders, of unknown poses")
     parser.add_argument("--only", nargs="*", help="names of scenes")
     wanted = parser.parse_args()
     rows = {}
     print("| scene | images | pycolmap: registered | right | s | slimsfm: registered | right | s | said |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|---|")
-    for name, folder, truth in scenes(wanted.output, wanted.photos, wanted.other):
+    for name, folder, truth in scenes(wanted.output, wanted.photos, wanted.other, wanted.more):
         if wanted.only and name not in wanted.only:
             continue
         a, b = measured(plain, folder, truth), measured(ours, folder, truth)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 
 import numpy as np
@@ -102,7 +103,7 @@ def test_photos_give_their_own_ground_truth(boulder, tmp_path):
     assert "n°-n cm: not available" in done.out
     assert "1 object, 3 queries" in done.out
     assert "1 objects" not in done.out
-    assert "sift: dominating sets of 1 image;" in done.out
+    assert re.search(r"sift: dominating sets of (1 image|\d+ images);", done.out)
 
 
 def test_two_runs_are_compared_line_by_line(synthetic, boulder, tmp_path):

@@ -12,6 +12,7 @@ from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import observed
+from slimsfm.mapping.support import measure
 
 GOOD = Evidence(inliers=80, distinct=60, matched=100, predicted_error=0.004, rival=0, found=0.6)
 WORSE = {
@@ -49,6 +50,17 @@ def test_an_exact_view_has_full_evidence(exact):
     assert evidence.rival == 0
     assert evidence.found > 0.9
     assert last.pose.confidence == evidence.confidence > 0.9
+
+
+def test_next_to_contradicted_images_the_confidence_is_lower_and_elsewhere_it_is_not(exact):
+    quality = measure(exact.model, {}, exact.images)
+    doubted = replace(exact, info=replace(exact.info, quality=replace(quality, doubtful=("001.png",))))
+    names = list(exact.images)
+    far = names[len(names) // 2]
+    for name in ("001.png", far):
+        query = exact.features[name]
+        before, after = (found_with(map_, query, camera()).pose.confidence for map_ in (exact, doubted))
+        assert after == pytest.approx(0.6 * before if name == "001.png" else before)
 
 
 def seen_from(map_, cam_from_world, part=slice(None)):

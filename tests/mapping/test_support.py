@@ -7,7 +7,6 @@ import pycolmap
 import pytest
 
 from scenes import exact_map, with_matches
-from slimsfm.localization.verification import Evidence
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.support import agreement, largest_piece, measure, trusted_pairs
@@ -101,9 +100,3 @@ def test_quality_and_notes_are_stored_in_the_map(scene, tmp_path):
     assert again.quality is not None
     assert asdict(again.quality) == asdict(info.quality)
     assert again.quality.summary == info.quality.summary
-
-
-def test_confidence_is_lower_next_to_contradicted_images():
-    evidence = Evidence(inliers=200, distinct=200, matched=210, predicted_error=0.004, rival=0, found=0.9)
-    assert evidence.confidence > 0.95
-    assert replace(evidence, doubted=True).confidence == pytest.approx(0.6 * evidence.confidence)

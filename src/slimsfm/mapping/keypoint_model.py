@@ -51,7 +51,8 @@ def _reconstruct(
         poses = work.known.cam_from_world
         return triangulate(database, names, sfm, poses, seed=seed, progress=work.progress), ()
     try:
-        models = reconstruct(database, names, sfm, seed=seed, progress=work.progress)
+        split = options.camera == "auto"  # otherwise the user knows
+        models = reconstruct(database, names, sfm, seed=seed, split=split, progress=work.progress)
     except ReconstructionError as error:
         matches = verified_matches(database, dict(enumerate(names, start=1)))
         reasons = [str(error), diagnose(work.images, names, shrunk.features, matches)]

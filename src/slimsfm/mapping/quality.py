@@ -94,8 +94,8 @@ class ModelQuality:
         )
         return (
             f"{self.registered} of {self.given} photos registered, {agreeing} of {self.verified_pairs} "
-            f"verified pairs agree, {len(self.contradictions)} images contradicted; per image a median of "
-            f"{self.median_observations:.0f} observations; {self.triangulation_angle_deg:.1f} degrees "
+            f"verified pairs agree, {len(self.contradictions)} images contradicted; an image sees a median "
+            f"of {self.median_observations:.0f} points; {self.triangulation_angle_deg:.1f} degrees "
             f"between rays; focal length over longer side {focal_lengths}"
         )
 

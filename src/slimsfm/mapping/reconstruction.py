@@ -43,9 +43,23 @@ _SMALLEST = 3  # images of a model
 
 
 def reconstruct(
-    database: Path, names: list[str], workspace: Path, *, seed: int, progress: ProgressBar = silent
+    database: Path,
+    names: list[str],
+    workspace: Path,
+    *,
+    seed: int,
+    split: bool = True,
+    progress: ProgressBar = silent,
 ) -> list[CheckedModel]:
     """Reconstruct the images of a database.
+
+    Args:
+        database: Images, numbered from 1, with features and verified matches.
+        names: Their names.
+        workspace: Folder for intermediate files.
+        seed: Seed of every random choice.
+        split: Give photos of one camera several cameras if their focal lengths differ.
+        progress: Progress callback.
 
     Returns:
         The right models, which hardly have images in common, largest first. If all are contradicted, the
@@ -55,17 +69,24 @@ def reconstruct(
         ReconstructionError: No model is in one piece, with parallax and possible focal lengths.
     """
     workspace.mkdir(parents=True, exist_ok=True)
-    return _Search(database, names, workspace, seed, progress).run()
+    return _Search(database, names, workspace, seed, split, progress).run()
 
 
 class _Search:
     """Maps the images of a database in one way after the other until a model is right."""
 
     def __init__(
-        self, database: Path, names: list[str], workspace: Path, seed: int, progress: ProgressBar
+        self,
+        database: Path,
+        names: list[str],
+        workspace: Path,
+        seed: int,
+        may_split: bool,
+        progress: ProgressBar,
     ) -> None:
         self._database, self._names, self._workspace = database, names, workspace
-        self._seed, self._progress, self._split = seed, progress, ()
+        self._seed, self._progress = seed, progress
+        self._may_split, self._split = may_split, ()
         self._ids = {name: image_id for image_id, name in enumerate(names, start=1)}
         self._matches = verified_matches(database, {i: name for name, i in self._ids.items()})
 
@@ -83,10 +104,21 @@ class _Search:
         return [replace(checked, split=self._split) for checked in best(attempts)]
 
     def _map(
-        self, database: Path, *, seed: int | None = None, start: pycolmap.Reconstruction | None = None
+        self,
+        database: Path,
+        way: str = "",
+        *,
+        seed: int | None = None,
+        start: pycolmap.Reconstruction | None = None,
     ) -> list[pycolmap.Reconstruction]:
-        seed = self._seed if seed is None else seed
-        return map_incrementally(database, self._names, seed=seed, progress=self._progress, start=start)
+        return map_incrementally(
+            database,
+            self._names,
+            seed=self._seed if seed is None else seed,
+            progress=self._progress,
+            label=" ".join(["register images", way]).strip(),
+            start=start,
+        )
 
     def _check(self, models: list[pycolmap.Reconstruction], way: str = "") -> Attempt:
         """The models of an attempt, without the smallest, best first."""
@@ -101,16 +133,16 @@ class _Search:
 
     def _with_right_cameras(self, first: Attempt) -> Attempt:
         """Another attempt with more cameras, if photos that share one have several focal lengths."""
-        if not first or not has_several_focal_lengths(first[0].model):
+        if not self._may_split or not first or not has_several_focal_lengths(first[0].model):
             return first
         shared = self._cameras
         own = {image_id: own_camera(camera, image_id) for image_id, camera in shared.items()}
-        apart = self._check(self._map(self._copy("own-cameras", cameras=own)))
+        apart = self._check(self._map(self._copy("own-cameras", cameras=own), "with own cameras"))
         if not apart:
             return first
         split = split_cameras(apart[0].model, shared)
         database = self._copy("split-cameras", cameras=split)
-        grouped = self._check(self._map(database))
+        grouped = self._check(self._map(database, "with split cameras"))
         if not grouped or not grouped[0].is_right or not explains_more(grouped[0], first[0]):
             return first
         self._database, self._split = database, _smaller_groups(split, shared, self._names)
@@ -143,7 +175,7 @@ class _Search:
         wide = pair_subsets.wide(self._matches, self._keypoints)
         yield self._from_pairs(wide, "from pairs whose matches cover their images")
         for seed in (self._seed + 1, self._seed + 2):
-            yield self._check(self._map(self._database, seed=seed), f"with seed {seed}")
+            yield self._check(self._map(self._database, f"with seed {seed}", seed=seed), f"with seed {seed}")
         yield from self._globally()
 
     @cached_property
@@ -161,7 +193,7 @@ class _Search:
 
     def _from_pairs(self, pairs: set[Pair], way: str) -> Attempt:
         """Map some pairs, and extend the models by all pairs that they bear out."""
-        models = self._check(self._map(self._copy("pairs", pairs=pairs)), way)
+        models = self._check(self._map(self._copy("pairs", pairs=pairs), way), way)
         return sorted((self._extended(model) for model in models), key=rank, reverse=True)
 
     def _extended(self, start: CheckedModel) -> CheckedModel:
@@ -171,7 +203,9 @@ class _Search:
         images = {name: start.model.image(self._ids[name]) for name in start.images}
         agreeing = agreement(images, self._matches)
         pairs = {pair for pair in self._matches if agreeing.get(pair, 1.0) >= MIN_AGREEING}
-        models = self._map(self._copy("extended", pairs=pairs), start=start.model)
+        models = self._map(
+            self._copy("extended", pairs=pairs), "from all pairs that agree", start=start.model
+        )
         for extended in self._check(models, start.way):
             if extended.is_right and extended.quality.registered >= start.quality.registered:
                 return extended

@@ -56,6 +56,7 @@ def map_incrementally(
     *,
     seed: int,
     progress: ProgressBar = silent,
+    label: str = "register images",
     start: pycolmap.Reconstruction | None = None,
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct the images of a database by incremental mapping [1].
@@ -65,6 +66,7 @@ def map_incrementally(
         names: Names of the images, which the database numbers from 1.
         seed: Seed of every random choice.
         progress: Progress callback.
+        label: What the progress is of.
         start: A model to extend, of the same images and cameras. By default, mapping starts anew.
 
     Returns:
@@ -93,7 +95,7 @@ def map_incrementally(
 
     with (
         threadpool_limits(1),
-        counted(progress, len(names), "register images") as advance_to,
+        counted(progress, len(names), label) as advance_to,
         _scratch() as folder,
     ):
         if start is not None:

@@ -191,6 +191,7 @@ class DetectorFree:
             cam_from_world=poses,
             masks=_masks(work),
             number=options.model,
+            split=options.camera == "auto",
             seed=options.seed,
             progress=work.progress,
         )

@@ -231,6 +231,7 @@ def build_without_keypoints(
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None = None,
     masks: Mapping[str, PhotoMask] | None = None,
     number: int = 1,
+    split: bool = True,
     seed: int = 0,
     progress: ProgressBar = silent,
 ) -> KeypointFreeModel:
@@ -245,6 +246,7 @@ def build_without_keypoints(
         cam_from_world: Known poses by image name; then poses and cameras are not refined.
         masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
         number: Which model to keep if there are several, from 1, the largest.
+        split: Give photos of one camera several cameras if their focal lengths differ.
         seed: Seed of all random choices.
         progress: Progress callback.
 
@@ -253,7 +255,9 @@ def build_without_keypoints(
         ReconstructionError: No model can be reconstructed from the photos.
     """
     cells = match_without_keypoints(photos, pairs, matcher, masks, progress)
-    rough, notes, matches = _reconstruct(cells, cameras, cam_from_world, workspace, number, seed, progress)
+    rough, notes, matches = _reconstruct(
+        cells, cameras, cam_from_world, workspace, number, split, seed, progress
+    )
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
     if cam_from_world is None:
         _adjust(refined.model, max(1.0, float(np.median(list(cells.cell_px.values()))) / _CELL_PX))
@@ -270,6 +274,7 @@ def _reconstruct(
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None,
     workspace: Path,
     number: int,
+    split: bool,
     seed: int,
     progress: ProgressBar,
 ) -> tuple[pycolmap.Reconstruction, tuple[str, ...], Matches]:
@@ -289,7 +294,7 @@ def _reconstruct(
     if cam_from_world is not None:
         model = triangulate(database, names, workspace / "sfm", cam_from_world, seed=seed, progress=progress)
     else:
-        models = reconstruct(database, names, workspace / "sfm", seed=seed, progress=progress)
+        models = reconstruct(database, names, workspace / "sfm", seed=seed, split=split, progress=progress)
         model, notes = pick_model(models, number)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=cam_from_world is not None)
