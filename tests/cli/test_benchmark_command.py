@@ -47,11 +47,14 @@ def test_a_run_writes_the_table_in_every_format(synthetic):
     assert "\\toprule" in (folder / "table.tex").read_text()
     assert f"| {NAME} | sift | direct | points:300 |" in (folder / "table.md").read_text()
     assert all(variant in done.out for variant in BRIEF[3:])
+    assert f"{NAME}, sift: {MAPPING_FRAMES} of {MAPPING_FRAMES} photos registered, " in done.out
+    assert "warning" not in done.out
 
 
 def test_a_run_keeps_its_maps_and_records_its_environment(synthetic):
     folder, _ = synthetic
     run = read_run(folder)
+    assert run.objects[0].maps[0].quality == read_map(run.map_path(NAME, "sift", "full")).info.quality
     slim = read_map(run.map_path(NAME, "sift", "points:300"))
     assert len(slim.point3D_ids) == 300
     assert {"numpy", "pycolmap", "python", "cpu", "gpu"} <= run.environment.keys()

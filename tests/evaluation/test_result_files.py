@@ -18,6 +18,7 @@ from slimsfm.evaluation.result_files import (
 )
 from slimsfm.evaluation.results import MapRun, Measurement, Outcomes, PosedQuery
 from slimsfm.geometry import Box
+from slimsfm.mapping.quality import ModelQuality
 
 QUERIES = 20
 
@@ -140,6 +141,46 @@ def test_the_digest_depends_only_on_poses_and_maps(run):
     assert digest_of([mug, can]) != before
 
 
+def with_quality(result):
+    """The object with a measured map that is doubted."""
+    quality = ModelQuality(
+        given=12,
+        registered=10,
+        verified_pairs=30,
+        contradicted_pairs=3,
+        trusted_pairs=9,
+        contradictions={"1.png": 0.1 + 0.2, "2.png": 0.0},
+        doubtful=("1.png", "2.png", "3.png"),
+        median_observations=100.5,
+        median_track_length=3.0,
+        triangulation_angle_deg=12.25,
+        camera_spread=1.5,
+        focal_lengths={"1.png": 1.2},
+        focal_origins={"1.png": "guessed"},
+        pieces=(10,),
+    )
+    maps = (replace(result.maps[0], quality=quality, notes=("a note",)), *result.maps[1:])
+    return replace(result, maps=maps)
+
+
+def test_the_quality_of_maps_is_stored_and_does_not_change_the_digest(run, tmp_path):
+    measured = with_quality(run.objects[0])
+    write_json(tmp_path / "can.json", object_to_json(measured))
+    found = read_object_result(tmp_path / "can.json")
+    assert found.maps == measured.maps
+    assert digest_of([found]) == digest_of(run.objects[:1])
+
+
+def test_results_without_quality_stay_readable(run, written):
+    data = json.loads(written.read_text())
+    for mapped in (one for result in data["objects"] for one in result["maps"]):
+        del mapped["quality"], mapped["notes"]
+    written.write_text(json.dumps(data))
+    found = read_run(written)
+    assert [(one.maps[0].quality, one.maps[0].notes) for one in found.objects] == [(None, ())] * 2
+    assert digest_of(found.objects) == digest_of(run.objects) == data["digest"]
+
+
 def with_outcomes(result, **fields):
     cell = result.measurements[0]
     trial = replace(cell.map_runs[0], outcomes=replace(cell.outcomes, **fields))
@@ -205,6 +246,7 @@ DAMAGE = {
     "words for numbers": put(["good"] * QUERIES, *TRIAL, "error"),
     "an unknown camera": put("PINHOLE_9", "objects", 0, "queries", 0, "camera", "model"),
     "another field": put(1, "objects", 0, "maps", 0, "color"),
+    "quality of nothing": put({"given": 3}, "objects", 0, "maps", 0, "quality"),
 }
 
 

@@ -41,7 +41,7 @@ def test_nothing_contradicts_an_exact_model(scene):
     assert quality.verified_pairs == quality.trusted_pairs == 7
     assert quality.contradicted_pairs == 0
     assert quality.contradictions == {}
-    assert quality.doubts == quality.faults == ()
+    assert quality.doubts == quality.faults == quality.warnings == ()
     assert quality.pieces == (8,)
     assert quality.focal_lengths == {"001.png": pytest.approx(502.5 / 640)}
 
@@ -77,6 +77,8 @@ def test_images_without_common_points_are_pieces_of_which_the_largest_is_kept():
     quality = measure(model, {}, ["001.png"])
     assert quality.pieces == (5, 1, 1)
     assert any("fall into 3 pieces" in fault for fault in quality.faults)
+    assert any("may be wrong: its images fall into 3 pieces" in text for text in quality.warnings)
+    assert replace(quality, focal_origins={"001.png": "given"}).warnings == ()
     kept = largest_piece(model)
     assert kept.num_reg_images() == 5
     assert measure(kept, {}, ["001.png"]).pieces == (5,)

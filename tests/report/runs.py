@@ -1,14 +1,14 @@
 """A benchmark run of exact scenes, measured like the command does, in a second."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image
 
-from scenes import exact_map
+from scenes import exact_map, with_matches
 from slimsfm.evaluation.benchmark import BenchmarkOptions
 from slimsfm.evaluation.result_files import write_results
 from slimsfm.evaluation.results import (
@@ -29,6 +29,7 @@ from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map, weigh_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.support import measure
 from slimsfm.reduction import DominatingSetOptions, dominating_set
 
 _OPTIONS = BenchmarkOptions(strategies=("exhaustive", "direct"))
@@ -81,6 +82,11 @@ def _measured(folder: Path, name: str, count: int) -> ObjectResult:
                 dominating_set=chosen,
                 lower_bound=int(solution.lower_bound),
                 dominating_points=len(stored["dominating"][0].point3D_ids),
+                quality=replace(
+                    measure(truth.model, with_matches(truth).matches, truth.images),
+                    focal_origins={names[0]: "given"},
+                ),
+                notes=("a <raw> photo was skipped",),
             ),
         ),
         measurements=tuple(

@@ -10,6 +10,7 @@ from browsing import browsing, opened, viser, wait_until
 from slimsfm.errors import InputError
 from slimsfm.mapping.map import PointDescriptors
 from slimsfm.mapping.subset import copy_images, copy_points, direct_map
+from slimsfm.mapping.support import measure
 from slimsfm.report.live import MapWithSize, live_view
 from slimsfm.report.live_panel import DROPPED_RGB, KEPT_RGB, plain_markdown
 from slimsfm.report.scene3d import view_frame
@@ -66,6 +67,16 @@ def test_one_map_is_shown_with_its_points_and_images(full, watching):
     np.testing.assert_array_equal(points.colors, full.colors)
     assert descriptions(browser) == ["4 images, 30 points, 24 MB"]
     assert browser.viewer.switch == {}
+    assert browser.viewer.warnings == []
+
+
+def test_a_doubted_map_is_shown_with_a_warning(full):
+    quality = replace(measure(full.model, {}, full.images), contradictions={"a_1.jpg": 0.2})
+    doubted = replace(full, info=replace(full.info, quality=quality))
+    with opened(doubted) as view, browsing(view) as browser:
+        (warning,) = browser.viewer.warnings
+        assert plain_markdown("contradict the poses of 1 of 4 images") in warning.content
+        assert plain_markdown("a_1.jpg (20%)") in warning.content
 
 
 def test_the_box_has_its_twelve_edges(full, watching):

@@ -7,7 +7,7 @@ from typing import Annotated
 from slimsfm.cli.arguments import Execution, Networks, resumable
 from slimsfm.cli.options import Advanced, Argument, OutputPath, Positional, Prefixed, Typed
 from slimsfm.cli.output import Stopwatch, console, finish, plural
-from slimsfm.cli.tables import print_comparisons, print_summary
+from slimsfm.cli.tables import print_comparisons, print_summary, print_support
 from slimsfm.datasets.base import Dataset
 from slimsfm.errors import InputError
 from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup
@@ -53,6 +53,7 @@ def benchmark(
     run = replace(run, options={"command": command, **run.options})
     if run.objects:
         print_summary(write_results(run))
+        print_support(run.objects)
     for name, why in run.failed.items():
         console.print(f"{name}: not measured: {why}", style="red")
     if run.failed:

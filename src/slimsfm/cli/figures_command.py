@@ -7,6 +7,7 @@ from rich.markup import escape
 
 from slimsfm.cli.options import Argument, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
+from slimsfm.cli.tables import print_map_warnings
 from slimsfm.errors import InputError
 from slimsfm.evaluation.result_files import read_run
 from slimsfm.progress import shown
@@ -39,6 +40,7 @@ def figures(
     written = write_figures(measured, output, format, overwrite=overwrite, progress=shown)
     for warning in written.warnings:
         console.print(escape(warning), style="yellow")
+    print_map_warnings(measured.objects)
     for path, explanation in written.files.items():
         console.print(f"{escape(str(path))}  [dim]{explanation}[/dim]")
     finish(f"{output}: {len(written.files)} figures", watch, "report", run, "-o", "report.html")

@@ -94,8 +94,13 @@ def print_notes(map: Map) -> None:
     """Print what was skipped, ignored or guessed when a map was made, and what contradicts it."""
     for note in map.info.notes:
         console.print(f"note: {with_flags(note)}", style="yellow", markup=False)
-    for doubt in map.info.quality.doubts if map.info.quality else ():
-        console.print(f"warning: {doubt}", style="bold red", markup=False)
+    print_warnings(map)
+
+
+def print_warnings(map: Map) -> None:
+    """Print why a map is in doubt."""
+    for warning in map.info.quality.warnings if map.info.quality else ():
+        console.print(f"warning: {warning}", style="bold red", markup=False)
 
 
 def finish_map(made: Map, output: Path, watch: Stopwatch) -> None:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from slimsfm.cli.options import Argument, OutputPath
 from slimsfm.cli.output import Stopwatch, finish
+from slimsfm.cli.tables import print_map_warnings
 from slimsfm.errors import InputError
 from slimsfm.evaluation.result_files import read_run
 from slimsfm.files import check_writable
@@ -33,4 +34,5 @@ def report(
     if not measured.objects:
         raise InputError(f"{run}: no object could be measured; run slimsfm benchmark again")
     write_report(output, measured, overwrite=overwrite)
+    print_map_warnings(measured.objects)
     finish(str(output), watch)

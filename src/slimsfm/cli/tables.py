@@ -10,8 +10,9 @@ from slimsfm.cli.arguments import Execution, resumable
 from slimsfm.cli.output import console, counts, plural, size
 from slimsfm.errors import InputError
 from slimsfm.evaluation.comparison import Comparison, DominationSummary
-from slimsfm.evaluation.formats import format_p_value, format_value, row_labels
+from slimsfm.evaluation.formats import format_p_value, format_value, map_warnings, row_labels
 from slimsfm.evaluation.result_files import RunSummary
+from slimsfm.evaluation.results import ObjectResult
 from slimsfm.evaluation.table import BY_FRAME, Row, brief_columns, is_metric
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions, ReferenceGraph, load_or_compute_graph
@@ -174,6 +175,21 @@ def print_summary(summary: RunSummary) -> None:
     print_comparisons(averages or summary.comparisons)
     for one in summary.dominating_sets:
         console.print(_dominating_sets(one))
+
+
+def print_support(results: Sequence[ObjectResult]) -> None:
+    """Print one line per map on what supports it, and what contradicts it."""
+    for result in results:
+        for mapped in result.maps:
+            if mapped.quality:
+                console.print(f"{result.name}, {mapped.method}: {mapped.quality.summary}", markup=False)
+    print_map_warnings(results)
+
+
+def print_map_warnings(results: Sequence[ObjectResult]) -> None:
+    """Print why the maps that results were measured with are in doubt."""
+    for name, method, why in map_warnings(results):
+        console.print(f"warning: {name}, {method}: {why}", style="bold red", markup=False)
 
 
 def _dominating_sets(one: DominationSummary) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, MapPath
-from slimsfm.cli.output import console
+from slimsfm.cli.output import console, print_warnings
 from slimsfm.errors import InputError
 from slimsfm.localization.cameras import FocalLength, read_camera
 from slimsfm.mapping.io import bytes_by_part, read_map
@@ -55,6 +55,7 @@ def view(
         with live_view(*maps, queries=asked, host=host, port=port) as live:
             names = " and ".join(str(path) for path in paths)
             console.print(f"{live.address} shows {names}; Ctrl-C stops it")
+            print_warnings(maps[0].map)
             if images and (missing := live.show_photos(images, shown)):
                 count = f"{missing} of {len(live.scene.frusta)}"
                 console.print(f"{images}: {count} photos are missing or unreadable", style="yellow")

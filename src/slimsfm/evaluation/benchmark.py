@@ -217,6 +217,8 @@ def _mapped(method: Method, inputs: VariantInputs) -> MappedObject:
         dominating_set=names,
         lower_bound=int(solution.lower_bound),
         dominating_points=len(keep_images(inputs.map, names).point3D_ids),
+        quality=inputs.map.info.quality,
+        notes=inputs.map.info.notes,
     )
 
 

@@ -177,6 +177,27 @@ def _csv(header: list[str], values: list[dict]) -> str:
     return text.getvalue()
 
 
+def map_warnings(results: Sequence[ObjectResult]) -> list[tuple[str, str, str]]:
+    """Object, method and sentence for each reason to doubt the maps of objects."""
+    return [
+        (result.name, mapped.method, warning)
+        for result in results
+        for mapped in result.maps
+        for warning in (mapped.quality.warnings if mapped.quality else ())
+    ]
+
+
+def _markdown_maps(results: Sequence[ObjectResult]) -> str:
+    """Lists of what supports the maps of objects, and of reasons to doubt them."""
+    support = [
+        f"- {result.name}, {mapped.method}: {mapped.quality.summary if mapped.quality else 'not measured'}\n"
+        for result in results
+        for mapped in result.maps
+    ]
+    warnings = [f"- **warning**: {name}, {method}: {why}\n" for name, method, why in map_warnings(results)]
+    return "".join([*support, *warnings])
+
+
 def markdown_page(run: Run, rows: Sequence[Row], comparisons: Sequence[Comparison]) -> str:
     """A Markdown page with the tables of a run and its environment."""
     made = "\n".join(f"- {key}: {value}" for key, value in run.environment.items())
@@ -195,6 +216,9 @@ Faster: matching and pose estimation, without extraction.
 ## Dominating sets
 
 {markdown_summaries(summarize_domination(run.objects))}
+## Support of the full maps
+
+{_markdown_maps(run.objects)}
 ## Environment
 
 {made}

@@ -34,6 +34,7 @@ from slimsfm.evaluation.results import (
 from slimsfm.evaluation.table import Row, all_rows
 from slimsfm.files import replacing
 from slimsfm.geometry import Box
+from slimsfm.mapping.quality import quality_from_json
 
 RESULT_FORMAT_VERSION = 1
 
@@ -79,9 +80,7 @@ def object_from_json(data: dict) -> ObjectResult:
         unit=data["unit"],
         images=Path(data["images"]),
         queries=tuple(_query_from_json(one) for one in data["queries"]),
-        maps=tuple(
-            MappedObject(**{**one, "dominating_set": tuple(one["dominating_set"])}) for one in data["maps"]
-        ),
+        maps=tuple(_mapped_from_json(one) for one in data["maps"]),
         measurements=tuple(
             Measurement(
                 method=one["method"],
@@ -96,6 +95,18 @@ def object_from_json(data: dict) -> ObjectResult:
     if counts - {len(found.queries)}:
         raise ValueError(f"{len(found.queries)} queries, but {sorted(counts)} outcomes")
     return found
+
+
+def _mapped_from_json(data: dict) -> MappedObject:
+    """Results of earlier versions have neither quality nor notes."""
+    return MappedObject(
+        **{
+            **data,
+            "dominating_set": tuple(data["dominating_set"]),
+            "quality": quality_from_json(data.get("quality")),
+            "notes": tuple(data.get("notes", ())),
+        }
+    )
 
 
 def _query_to_json(query: PosedQuery) -> dict:
@@ -175,14 +186,14 @@ def _numbers(values: Sequence[float | None], missing: float) -> np.ndarray:
 
 
 def digest_of(objects: Sequence[ObjectResult]) -> str:
-    """Digest of maps and poses; it ignores times, paths and folders."""
+    """Digest of maps and poses; it ignores times, paths, folders and what is only said about maps."""
     data = [_comparable(object_to_json(one)) for one in objects]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _comparable(value: Any) -> Any:
     if isinstance(value, dict):
-        ignored = ("seconds", "images", "path")
+        ignored = ("seconds", "images", "path", "quality", "notes")
         return {key: _comparable(one) for key, one in value.items() if key not in ignored}
     return [_comparable(one) for one in value] if isinstance(value, list) else value
 

@@ -18,6 +18,7 @@ from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.map import Map
+from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation, read_image, read_photo
 from slimsfm.progress import ProgressBar, silent
 
@@ -113,6 +114,12 @@ class MappedObject:
 
     dominating_points: int
     """Number of points that the images of the dominating set observe."""
+
+    quality: ModelQuality | None = None
+    """What supports the map, and what contradicts it; None if that was not measured."""
+
+    notes: tuple[str, ...] = ()
+    """What was skipped, ignored or guessed when the map was made."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

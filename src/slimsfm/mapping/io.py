@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import cv2
 import h5py
@@ -36,7 +36,7 @@ from slimsfm.mapping.descriptors import (
 )
 from slimsfm.mapping.map import Map, MapInfo, check_map, check_num_features
 from slimsfm.mapping.model import read_model
-from slimsfm.mapping.quality import ModelQuality
+from slimsfm.mapping.quality import quality_from_json
 from slimsfm.photos import Orientation, shrink
 
 _QUALITY = 95
@@ -217,13 +217,6 @@ def _info_to_json(map: Map) -> dict:
     }
 
 
-def _quality(data: dict[str, Any] | None) -> ModelQuality | None:
-    if data is None:
-        return None
-    lists = {key: tuple(data[key]) for key in ("doubtful", "pieces")}
-    return ModelQuality(**{**data, **lists})
-
-
 def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
     return np.array(values, np.float64).reshape(shape)
 
@@ -253,7 +246,7 @@ def _read_info(path: Path) -> MapInfo:
             unit=data["unit"],
             origin=data["origin"],
             notes=tuple(map(str, data.get("notes", ()))),
-            quality=_quality(data.get("quality")),
+            quality=quality_from_json(data.get("quality")),
             orientation=_orientation(data.get("orientation", "upright")),
             exif_orientations={
                 str(name): int(tag) for name, tag in data.get("exif_orientations", {}).items()

@@ -1,6 +1,7 @@
 """The quality of a model: what supports it, and what contradicts it."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 MIN_COMMON_POINTS = 15
 """Points that two images must both see to be joined."""
@@ -111,3 +112,21 @@ class ModelQuality:
             "folded: parts that look alike are laid over each other, and poses may be wrong. Contradicted, "
             f"with the share of matches that agree: {', '.join(shares[:_LISTED])}{more}",
         )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts, and the faults that an imported model may have. Known poses do not depend on points."""
+        faults = () if "given" in self.focal_origins.values() else self.faults
+        return (*self.doubts, *(f"the model may be wrong: {fault}" for fault in faults))
+
+
+def quality_from_json(data: dict[str, Any] | None) -> ModelQuality | None:
+    """A quality from the plain values that `dataclasses.asdict` gives; None stays None.
+
+    Raises:
+        KeyError, TypeError: A value is missing or unknown.
+    """
+    if data is None:
+        return None
+    lists = {key: tuple(data[key]) for key in ("doubtful", "pieces")}
+    return ModelQuality(**{**data, **lists})

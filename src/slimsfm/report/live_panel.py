@@ -73,6 +73,11 @@ class ViewerPanel:
         )
         self.descriptions: dict[str, viser.GuiMarkdownHandle] = {}
         self.switch = self._add_switch()
+        quality = view.maps[BEFORE].map.info.quality
+        self.warnings = [
+            client.gui.add_markdown(f"**Warning:** {plain_markdown(warning)}")
+            for warning in (quality.warnings if quality else ())
+        ]
         self.point_size = client.gui.add_slider("Point size", 0.2, 5.0, 0.1, 1.0)
         self.point_size.on_update(lambda _: self._resize_points())
         kept = _images_to_match(list(view.maps.values())[-1].map) if len(view.maps) > 1 else None

@@ -23,6 +23,7 @@ from slimsfm.report.formatting import (
     rows_html,
     table_html,
 )
+from slimsfm.report.map_support import warnings_html
 from slimsfm.report.reliability import reliability_chart
 from slimsfm.report.report_data import ReportData
 from slimsfm.report.tradeoffs import frontier_chart
@@ -48,6 +49,7 @@ def overview_html(data: ReportData, anchors: Mapping[str, str]) -> str:
             f'<p class="headline">{escape(_headline(data, lines))}</p>',
             f'<p class="note">{_ADD}</p>',
             _failed(data),
+            warnings_html(data.run, anchors),
             _tiles(data, lines[0]) if lines else "",
             _objects(data, anchors),
             failures_html(data) if lines else "",

@@ -20,6 +20,7 @@ from slimsfm.report.formatting import (
     rows_html,
 )
 from slimsfm.report.graph_view import GraphDrawing, graph_html
+from slimsfm.report.map_support import support_html
 from slimsfm.report.overview import charts_html, overview_html
 from slimsfm.report.report_data import (
     ReportBudget,
@@ -121,6 +122,8 @@ def _section(maps: RunMaps, data: ReportData, anchor: str, *, is_open: bool) -> 
 <summary><h2>{escape(result.name)}</h2><p class="headline">{escape(said)}</p></summary>
 <p>{method}{escape(format_dominating_set(maps.mapped))}</p>
 {_view(maps, budget)}
+<h3>Support of the full map</h3>
+{support_html(maps.mapped)}
 <h3>Reference graph</h3>
 {graph_html(drawing, result.images, budget.photo_px)}
 <h3>Accuracy and speed</h3>
