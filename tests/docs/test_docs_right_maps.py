@@ -21,7 +21,7 @@ PAGE = " ".join((Path(__file__).parents[2] / "docs" / "right-maps.md").read_text
         ("within {:g} of the distance to the points", measured._CLOSE),
         ("moves {:.0%} of the matches", parallax._EXPLAINED),
         ("to within {:.1%} of the longer side", parallax._MAX_ERROR),
-        ("If rotations explain {:.0%} of the pairs", quality._WITHOUT_PARALLAX),
+        ("If rotations explain {:.0%} of the pairs", quality.WITHOUT_PARALLAX),
         ("between {:g} and", quality._MIN_FOCAL),
         ("and {:g} times the longer side", quality._MAX_FOCAL),
         ("the focal lengths of {:.0%} of the photos", camera_groups._LEAST_SHARE),

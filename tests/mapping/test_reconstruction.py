@@ -145,12 +145,13 @@ def test_two_places_are_two_models_and_either_can_be_picked(tmp_path):
     second = cloud(2, 200, around(8, turn=np.pi), "second")
     models = mapped(tmp_path, first, second)
     assert [one.images for one in models] == [tuple(first.names), tuple(second.names)]
-    model, notes = pick_model(models, 1)
-    assert model is models[0].model
-    (note,) = notes
+    picked = pick_model(models, 1)
+    assert picked.model is models[0].model
+    assert picked.elsewhere == set(second.names)
+    (note,) = picked.notes
     assert "8 photos form another model, which `model=2` keeps" in note
     assert all(name in note for name in second.names)
-    assert pick_model(models, 2)[0] is models[1].model
+    assert pick_model(models, 2).model is models[1].model
     with pytest.raises(InputError, match=r"model must be at most 2, got 3.*models of 12, 8 images"):
         pick_model(models, 3)
 
@@ -174,7 +175,7 @@ def test_photos_of_one_camera_that_are_zoomed_get_another_camera(tmp_path):
     assert only.split == tuple(photos.names[number] for number in zoomed)
     found = sorted(camera.mean_focal_length() for camera in only.model.cameras.values())
     assert found == pytest.approx([FOCAL, 1.5 * FOCAL], rel=0.02)
-    assert "5 photos have another focal length than others of their camera" in pick_model([only], 1)[1][0]
+    assert "5 photos have another focal length than others of their camera" in pick_model([only], 1).notes[0]
 
 
 @pytest.mark.parametrize("turn", [0.35, 1.2])
@@ -201,3 +202,13 @@ def test_two_photos_of_nothing_in_common_are_named_as_such(tmp_path):
     one.cam_from_world, other.cam_from_world = one.cam_from_world[:1], other.cam_from_world[:1]
     with pytest.raises(ReconstructionError, match="no three photos could be joined"):
         mapped(tmp_path, one, other)
+
+
+def test_a_right_model_does_not_hide_a_contradicted_one(tmp_path):
+    folded, other = can(24), cloud(3, 200, around(8, turn=np.pi), "other")
+    folded.labels = 1000 + folded.labels
+    models = mapped(tmp_path, folded, other)
+    names = {name for one in models for name in one.images}
+    assert set(other.names) <= names
+    assert len(names & set(folded.names)) >= 18
+    assert all(one.is_right for one in models)

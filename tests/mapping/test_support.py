@@ -9,7 +9,7 @@ import pytest
 from scenes import exact_map, with_matches
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
-from slimsfm.mapping.support import agreement, largest_piece, measure, trusted_pairs
+from slimsfm.mapping.support import agreement, measure, pieces_of, trusted_pairs
 
 
 def rows(count: int) -> np.ndarray:
@@ -79,8 +79,9 @@ def test_images_without_common_points_are_pieces_of_which_the_largest_is_kept():
     assert any("fall into 3 pieces" in fault for fault in quality.faults)
     assert any("may be wrong: its images fall into 3 pieces" in text for text in quality.warnings)
     assert replace(quality, focal_origins={"001.png": "given"}).warnings == ()
-    kept = largest_piece(model)
+    (kept,) = pieces_of(model, min_images=3)
     assert kept.num_reg_images() == 5
+    assert len(pieces_of(model, min_images=1)) == 3
     assert measure(kept, {}, ["001.png"]).pieces == (5,)
     assert model.num_reg_images() == 7
 
@@ -100,3 +101,16 @@ def test_quality_and_notes_are_stored_in_the_map(scene, tmp_path):
     assert again.quality is not None
     assert asdict(again.quality) == asdict(info.quality)
     assert again.quality.summary == info.quality.summary
+
+
+def test_copies_of_a_photo_do_not_contradict_each_other(scene):
+    model = pycolmap.Reconstruction(scene.model)
+    copied = scene.images["001.png"].cam_from_world()
+    model.frame(model.image(2).frame_id).rig_from_world = copied
+    seen = np.arange(20)
+    for row in seen:
+        model.image(2).points2D[row].xy = model.image(1).points2D[row].xy
+    images = {image.name: image for image in model.images.values()}
+    pair = ("001.png", "002.png")
+    assert agreement(images, {pair: np.stack([seen, seen], axis=1)}) == {pair: 1.0}
+    assert agreement(images, {pair: np.stack([seen, np.roll(seen, 1)], axis=1)})[pair] < 0.5

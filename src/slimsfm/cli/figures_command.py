@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rich.markup import escape
-
 from slimsfm.cli.options import Argument, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
 from slimsfm.cli.tables import print_map_warnings
@@ -39,8 +37,8 @@ def figures(
         raise InputError(f"{run}: no object could be measured; run slimsfm benchmark again")
     written = write_figures(measured, output, format, overwrite=overwrite, progress=shown)
     for warning in written.warnings:
-        console.print(escape(warning), style="yellow")
+        console.print(warning, style="yellow")
     print_map_warnings(measured.objects)
     for path, explanation in written.files.items():
-        console.print(f"{escape(str(path))}  [dim]{explanation}[/dim]")
+        console.print(f"{path}  {explanation}")
     finish(f"{output}: {len(written.files)} figures", watch, "report", run, "-o", "report.html")

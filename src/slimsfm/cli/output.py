@@ -23,7 +23,7 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-console = _Console(highlight=False, soft_wrap=True, width=_WIDTH)
+console = _Console(highlight=False, markup=False, soft_wrap=True, width=_WIDTH)
 
 
 def check_output(output: Path, *sources: Path | None, overwrite: bool) -> None:

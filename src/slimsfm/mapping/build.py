@@ -66,7 +66,7 @@ def build_map(
             parts = _build(work, extractor, options)
         except ReconstructionError as error:  # what was skipped may be the reason
             raise ReconstructionError("; ".join([str(error), *notes, *work.photos.notes])) from error
-    notes = (*notes, *work.photos.notes, *parts.notes)
+    notes = (*notes, *work.photos.notes, *(parts.picked.notes if parts.picked else ()))
     return with_global_descriptors(_map(parts, work, exifs, given_box, notes, options))
 
 
@@ -112,10 +112,12 @@ def _map(
     options: BuildOptions,
 ) -> Map:
     """The map of a model, without global descriptors."""
-    quality, names = measure(parts.model, parts.matches, work.names), work.names
+    names, picked = work.names, parts.picked
+    quality = picked.quality if picked else measure(parts.model, parts.matches, names)
     if work.known:  # a known pose is believed more than look-alike matches
         quality = replace(quality, contradictions={}, doubtful=())
-    registered = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
+    used = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
+    used |= picked.elsewhere if picked else set()
     info = MapInfo(
         extractor=parts.extractor.name,
         extractor_options=parts.extractor.options,
@@ -134,7 +136,7 @@ def _map(
         matches=parts.matches,
         photos=parts.photos,
         info=info,
-        unregistered=tuple(name for name in names if name not in registered),
+        unregistered=tuple(name for name in names if name not in used),
     )
 
 

@@ -83,7 +83,7 @@ def split_cameras(
 
     Returns:
         A camera for each image, with the id of the first image of its group. Images that are not in the model
-        are with the largest group of their camera.
+        are with the largest group of their camera. A camera none of whose images is in the model stays whole.
     """
     of_camera: dict[int, list[int]] = defaultdict(list)
     for image_id in sorted(model.reg_image_ids()):
@@ -100,8 +100,9 @@ def split_cameras(
         for image_id, camera in cameras.items():
             if camera.camera_id == camera_id:
                 split.setdefault(image_id, largest)
+    first = {camera.camera_id: image_id for image_id, camera in sorted(cameras.items(), reverse=True)}
     for image_id, camera in cameras.items():
-        split.setdefault(image_id, own_camera(camera, image_id))
+        split.setdefault(image_id, own_camera(camera, first[camera.camera_id]))
     return split
 
 

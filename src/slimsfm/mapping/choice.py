@@ -79,15 +79,23 @@ def reached(attempt: Attempt) -> int:
     return len({name for checked in attempt for name in checked.images})
 
 
+def is_contradicted(attempt: Attempt) -> bool:
+    """Whether a model of many photos is contradicted."""
+    return any(checked.quality.contradictions and _is_large(checked) for checked in attempt)
+
+
 def best(attempts: list[Attempt]) -> list[CheckedModel]:
-    """The right models of the attempt that registers most images, or the least contradicted model.
+    """The models of the attempt that registers most images rightly: right ones first, then contradicted ones.
+
+    If no attempt has a right model, the least contradicted one alone.
 
     Raises:
         ReconstructionError: All models have faults or hardly any images.
     """
     attempt = max(attempts, key=registered)
     if registered(attempt):
-        return _apart([checked for checked in attempt if checked.is_right])
+        doubted = [one for one in attempt if one.quality.contradictions and not one.quality.faults]
+        return _apart([one for one in attempt if one.is_right]) + _apart(doubted, but=attempt)
     usable = [checked for attempt in attempts for checked in attempt if not checked.quality.faults]
     large = [checked for checked in usable if _is_large(checked)]
     if not large:
@@ -95,13 +103,14 @@ def best(attempts: list[Attempt]) -> list[CheckedModel]:
     return [min(large, key=lambda one: (one.quality.contradicted_share, -one.quality.registered))]
 
 
-def _apart(models: list[CheckedModel]) -> list[CheckedModel]:
-    """Models most of whose images are not in a larger one."""
+def _apart(models: list[CheckedModel], but: Attempt | None = None) -> list[CheckedModel]:
+    """Models most of whose images are in no larger one, nor in a right one of an attempt."""
     kept: list[CheckedModel] = []
-    used: set[str] = set()
+    used = {name for checked in but or () if checked.is_right for name in checked.images}
     for checked in sorted(models, key=lambda checked: -checked.quality.registered):
         new = len(set(checked.images) - used)
-        if not kept or (new >= _SMALLEST_OTHER and 2 * new > len(checked.images)):
+        is_first = not kept and not but
+        if is_first or (new >= _SMALLEST_OTHER and 2 * new > len(checked.images)):
             kept.append(checked)
             used.update(checked.images)
     return kept
@@ -117,8 +126,25 @@ def _faults(attempts: list[Attempt]) -> str:
     return "; ".join(quality.faults) or small
 
 
-def pick_model(models: list[CheckedModel], number: int) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model with a number, from 1, and notes on how it was mapped and on the other models.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PickedModel:
+    """The model of a map, and what to say about it."""
+
+    model: pycolmap.Reconstruction
+    """The model; images have their names."""
+
+    quality: ModelQuality
+    """Its support."""
+
+    elsewhere: frozenset[str]
+    """Photos that are in other models."""
+
+    notes: tuple[str, ...]
+    """How it was mapped, and which other models there are."""
+
+
+def pick_model(models: list[CheckedModel], number: int) -> PickedModel:
+    """Pick a model by its number, from 1.
 
     Raises:
         InputError: There are not that many models.
@@ -130,15 +156,22 @@ def pick_model(models: list[CheckedModel], number: int) -> tuple[pycolmap.Recons
         )
     picked = models[number - 1]
     notes = [f"the photos were mapped {picked.way}"] if picked.way else []
-    if picked.split:
+    if split := sorted(set(picked.split).intersection(picked.images)):
         notes.append(
-            f"{len(picked.split)} photos have another focal length than others of their camera, and got "
-            f"another camera: {', '.join(picked.split)}"
+            f"{len(split)} photos have another focal length than others of their camera, and got another "
+            f"camera: {', '.join(split)}"
         )
     for other, checked in enumerate(models, start=1):
         if other != number:
+            doubt = ", but matches contradict it" if checked.quality.contradictions else ""
+            named = ", ".join(checked.images)
             notes.append(
-                f"{checked.quality.registered} photos form another model, which `model={other}` keeps: "
-                f"{', '.join(checked.images)}"
+                f"{len(checked.images)} photos form another model, which `model={other}` keeps"
+                f"{doubt}: {named}"
             )
-    return picked.model, tuple(notes)
+    return PickedModel(
+        model=picked.model,
+        quality=picked.quality,
+        elsewhere=frozenset(name for one in models for name in one.images).difference(picked.images),
+        notes=tuple(notes),
+    )

@@ -1,13 +1,14 @@
 """Build a model from keypoints: extract, match, reconstruct."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pycolmap
 
 from slimsfm.errors import ReconstructionError
 from slimsfm.features import Extractor, Features, load_matcher
-from slimsfm.mapping.choice import pick_model
+from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.diagnosis import diagnose
 from slimsfm.mapping.extraction import color_points, extract_features
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
@@ -33,7 +34,8 @@ def build_from_keypoints(work: BuildWork, extractor: Extractor, options: BuildOp
     sideways = TurnedFeatures(features, dict.fromkeys(work.turned, 1))
     shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
     database = _match(work, features, shrunk, options)
-    model, notes = _reconstruct(work, database, shrunk, options)
+    picked = _reconstruct(work, database, shrunk, options) if work.known is None else None
+    model = picked.model if picked else _triangulate(work, database, options)
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=work.known is not None)
     if work.turned:
@@ -41,17 +43,17 @@ def build_from_keypoints(work: BuildWork, extractor: Extractor, options: BuildOp
         model = turned_model(model, turns_back)
         put_keypoints(model, features)
     color_points(model, colors)
-    return MapParts(extractor=extractor, model=model, features=features, matches=matches, notes=notes)
+    return MapParts(extractor=extractor, model=model, features=features, matches=matches, picked=picked)
 
 
-def _reconstruct(
-    work: BuildWork, database: Path, shrunk: ShrunkImages, options: BuildOptions
-) -> tuple[pycolmap.Reconstruction, tuple[str, ...]]:
-    """The model, and notes on how it was chosen."""
+def _triangulate(work: BuildWork, database: Path, options: BuildOptions) -> pycolmap.Reconstruction:
+    poses = work.known.cam_from_world if work.known else {}
+    sfm = work.workspace / "sfm"
+    return triangulate(database, work.names, sfm, poses, seed=options.seed, progress=work.progress)
+
+
+def _reconstruct(work: BuildWork, database: Path, shrunk: ShrunkImages, options: BuildOptions) -> PickedModel:
     names, sfm, seed = work.names, work.workspace / "sfm", options.seed
-    if work.known:
-        poses = work.known.cam_from_world
-        return triangulate(database, names, sfm, poses, seed=seed, progress=work.progress), ()
     split = options.camera == "auto"  # otherwise the user knows
     try:
         models = reconstruct(database, names, sfm, seed=seed, split=split, progress=work.progress)
@@ -60,11 +62,13 @@ def _reconstruct(
         raise ReconstructionError(
             f"{work.images}: these {len(names)} photos give no model: {'; '.join(reasons)}"
         ) from error
-    model, notes = pick_model(models, options.model)
-    if model.num_reg_images() < _FEW * len(names):
-        few = f"the map has only {model.num_reg_images()} of {len(names)} photos"
-        notes = ("; ".join(filter(None, [few, _lacking(work, database, shrunk)])), *notes)
-    return model, notes
+    picked = pick_model(models, options.model)
+    registered = picked.quality.registered
+    if registered + len(picked.elsewhere) >= _FEW * len(names):
+        return picked
+    few = f"the map has only {registered} of {len(names)} photos"
+    lacking = "; ".join(filter(None, [few, _lacking(work, database, shrunk)]))
+    return replace(picked, notes=(lacking, *picked.notes))
 
 
 def _lacking(work: BuildWork, database: Path, shrunk: ShrunkImages) -> str:

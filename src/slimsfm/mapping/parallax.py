@@ -7,7 +7,6 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.arrays import Points2D
-from slimsfm.mapping.model import camera_of
 from slimsfm.mapping.pairs import Matches
 
 _PAIRS = 60  # that are looked at
@@ -17,24 +16,25 @@ _EXPLAINED = 0.9  # share of the matches of a pair
 _FOCAL_LENGTHS = np.geomspace(0.3, 6.0, 60)  # over the longer side
 
 
-def share_without_parallax(images: Mapping[str, pycolmap.Image], matches: Matches) -> float:
+def share_without_parallax(pixels: Mapping[str, Points2D], matches: Matches) -> float:
     """Share of the pairs of images whose matches a rotation explains, at the focal length that explains most.
 
     All cameras are taken to have the same focal length, relative to the longer side of their images.
+
+    Args:
+        pixels: Keypoints by image name, by `centered`.
+        matches: Verified matches.
     """
-    pairs = [p for p in matches if set(p) <= images.keys() and len(matches[p]) >= _LEAST_MATCHES]
+    pairs = [p for p in matches if set(p) <= pixels.keys() and len(matches[p]) >= _LEAST_MATCHES]
     explained = []
     for a, b in pairs[:: max(1, len(pairs) // _PAIRS)]:
-        pixels = _centered(images[a], matches[a, b][:, 0]), _centered(images[b], matches[a, b][:, 1])
-        explained.append([_explained(*pixels, focal) for focal in _FOCAL_LENGTHS])
+        matched = pixels[a][matches[a, b][:, 0]], pixels[b][matches[a, b][:, 1]]
+        explained.append([_explained(*matched, focal) for focal in _FOCAL_LENGTHS])
     return float(np.mean(explained, axis=0).max()) if explained else 0.0
 
 
-def _centered(image: pycolmap.Image, rows: np.ndarray) -> Points2D:
+def centered(pixels: Points2D, camera: pycolmap.Camera) -> Points2D:
     """Pixels relative to the center of the image, over its longer side."""
-    camera = camera_of(image)
-    points2D = image.points2D
-    pixels = np.array([points2D[row].xy for row in rows.tolist()], np.float64).reshape(-1, 2)
     return (pixels - (camera.width / 2, camera.height / 2)) / max(camera.width, camera.height)
 
 

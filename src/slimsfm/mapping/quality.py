@@ -1,13 +1,15 @@
 """The quality of a model: what supports it, and what contradicts it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 MIN_COMMON_POINTS = 15
 """Points that two images must both see to be joined."""
 
 _MIN_FOCAL, _MAX_FOCAL = 0.2, 15.0  # focal length over the longer side of the image
-_WITHOUT_PARALLAX = 0.8  # share of the pairs of a camera that only turned
+WITHOUT_PARALLAX = 0.8
+"""Share of the pairs of photos that rotations explain, of a camera that only turned."""
+
 _LISTED = 12  # names in a sentence
 
 
@@ -32,6 +34,9 @@ class ModelQuality:
 
     contradictions: dict[str, float] = field(default_factory=dict)
     """Images of contradicted trusted pairs: the smallest share of the matches of such a pair that agrees."""
+
+    ambiguous: bool = False
+    """Whether look-alike parts confused mapping, and the names of the photos give no order to check by."""
 
     doubtful: tuple[str, ...] = ()
     """Those images, and the images that share points with them: poses close to these are in doubt."""
@@ -75,11 +80,8 @@ class ModelQuality:
                 f"its images fall into {len(self.pieces)} pieces of {', '.join(map(str, self.pieces[:5]))} "
                 f"images, with fewer than {MIN_COMMON_POINTS} common points between them"
             )
-        if self.without_parallax >= _WITHOUT_PARALLAX:
-            found.append(
-                f"the camera turned but hardly moved (rotations explain {self.without_parallax:.0%} of the "
-                "pairs of photos); walk around while taking photos"
-            )
+        if self.without_parallax >= WITHOUT_PARALLAX:
+            found.append(turned(self.without_parallax))
         for name, focal in self.focal_lengths.items():
             if not _MIN_FOCAL <= focal <= _MAX_FOCAL:
                 found.append(f"the focal length of {name} would be {focal:.3g} times the image's longer side")
@@ -103,6 +105,11 @@ class ModelQuality:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Sentences on what contradicts the model, with names."""
+        if self.ambiguous and not self.contradictions:
+            return (
+                "parts of these photos look alike, and the names of the photos give no order to tell them "
+                "apart. The model may be folded; name the photos in the order in which they were taken",
+            )
         if not self.contradictions:
             return ()
         shares = [f"{name} ({share:.0%})" for name, share in self.contradictions.items()]
@@ -124,9 +131,18 @@ def quality_from_json(data: dict[str, Any] | None) -> ModelQuality | None:
     """A quality from the plain values that `dataclasses.asdict` gives; None stays None.
 
     Raises:
-        KeyError, TypeError: A value is missing or unknown.
+        KeyError, TypeError: A value is missing.
     """
     if data is None:
         return None
     lists = {key: tuple(data[key]) for key in ("doubtful", "pieces")}
-    return ModelQuality(**{**data, **lists})
+    known = {field.name for field in fields(ModelQuality)}  # later versions may store more
+    return ModelQuality(**{key: value for key, value in {**data, **lists}.items() if key in known})
+
+
+def turned(share: float) -> str:
+    """Say that a camera turned but hardly moved."""
+    return (
+        f"the camera turned but hardly moved (rotations explain {share:.0%} of the pairs of photos); walk "
+        "around while taking photos"
+    )

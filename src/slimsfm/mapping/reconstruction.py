@@ -22,22 +22,36 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Points2D
+from slimsfm.errors import ReconstructionError
 from slimsfm.mapping import pair_subsets
 from slimsfm.mapping.camera_groups import has_several_focal_lengths, own_camera, split_cameras
-from slimsfm.mapping.choice import Attempt, CheckedModel, best, explains_more, rank, reached, registered
+from slimsfm.mapping.choice import (
+    Attempt,
+    CheckedModel,
+    best,
+    explains_more,
+    is_contradicted,
+    rank,
+    reached,
+    registered,
+)
+from slimsfm.mapping.parallax import centered, share_without_parallax
+from slimsfm.mapping.quality import WITHOUT_PARALLAX, turned
 from slimsfm.mapping.scratch import copy_verified, verified_matches
 from slimsfm.mapping.sfm import map_globally, map_incrementally
-from slimsfm.mapping.support import MIN_AGREEING, Pair, agreement, largest_piece, measure
+from slimsfm.mapping.support import MIN_AGREEING, Pair, agreement, measure, pieces_of, trusted_pairs
 from slimsfm.progress import ProgressBar, silent, single_step
 
 _MOST = 0.9  # share of the photos with which a right model is taken at once
 _ENOUGH = 0.75  # share of the photos of contradicted models with which the search ends
+_HALF = 0.5  # share of all photos with which it ends otherwise, after global mapping
 _OVERLAPS = 10, 1  # neighbors in order of name
 _SMALLEST = 3  # images of a model
 
@@ -93,15 +107,41 @@ class _Search:
     def run(self) -> list[CheckedModel]:
         """Search, and return the right models or the least contradicted one."""
         first = self._with_right_cameras(self._check(self._map(self._database)))
-        attempts = [first]
-        partly_right = bool(first) and first[0].is_right
-        wanted = _MOST * len(self._names) if partly_right else _ENOUGH * reached(first)
-        if not registered(first) >= max(_MOST * len(self._names), 1) and self._matches:
-            for attempt in self._globally() if partly_right else self._ways():
+        attempts, photos = [first], len(self._names)
+        if registered(first) < _MOST * photos and self._matches:
+            contradicted = is_contradicted(first)
+            wanted = _ENOUGH * reached(first) if contradicted else _HALF * photos
+            self._check_parallax()
+            for attempt in self._ways() if contradicted else chain(self._globally(), self._ways(again=True)):
                 attempts.append(attempt)
-                if registered(attempt) >= max(wanted, 1):
+                if max(map(registered, attempts)) >= max(wanted, 1):
                     break
-        return [replace(checked, split=self._split) for checked in best(attempts)]
+            found = best(attempts)
+            if contradicted and not self._has_order():
+                found = [replace(one, quality=replace(one.quality, ambiguous=True)) for one in found]
+        else:
+            found = best(attempts)
+        return [replace(checked, split=self._split) for checked in found]
+
+    def _check_parallax(self) -> None:
+        """Check that the camera moved.
+
+        Raises:
+            ReconstructionError: Rotations explain the matches of most pairs of photos.
+        """
+        centered = {name: self._centered(name) for name in self._names}
+        share = share_without_parallax(centered, self._matches)
+        if share >= WITHOUT_PARALLAX:
+            raise ReconstructionError(turned(share))
+
+    def _centered(self, name: str) -> Points2D:
+        return centered(self._keypoints[name], self._cameras[self._ids[name]])
+
+    def _has_order(self) -> bool:
+        """Whether most photos have most in common with their neighbors in order of name."""
+        trusted = trusted_pairs(self._matches, self._names)
+        neighbors = pair_subsets.neighbors(self._matches, self._names, overlap=1)
+        return 2 * len(trusted & neighbors) >= len(trusted)
 
     def _map(
         self,
@@ -122,12 +162,10 @@ class _Search:
 
     def _check(self, models: list[pycolmap.Reconstruction], way: str = "") -> Attempt:
         """The models of an attempt, without the smallest, best first."""
-        least = min(_SMALLEST, len(self._names))
-        pieces = [largest_piece(model) for model in models if model.num_reg_images() >= least]
         checked = [
-            CheckedModel(model=model, quality=measure(model, self._matches, self._names), way=way)
-            for model in pieces
-            if model.num_reg_images() >= least and model.num_points3D()
+            CheckedModel(model=piece, quality=measure(piece, self._matches, self._names), way=way)
+            for model in models
+            for piece in pieces_of(model, min_images=_SMALLEST)
         ]
         return sorted(checked, key=rank, reverse=True)
 
@@ -167,7 +205,8 @@ class _Search:
         copy_verified(self._database, target, pairs=kept, cameras=cameras)
         return target
 
-    def _ways(self) -> Iterator[Attempt]:
+    def _ways(self, *, again: bool = False) -> Iterator[Attempt]:
+        """Attempts from some of the pairs, with other seeds and, unless it was done, globally."""
         for overlap in _OVERLAPS:
             pairs = pair_subsets.neighbors(self._matches, self._names, overlap=overlap)
             yield self._from_pairs(pairs, f"from neighbors in order of name, up to {overlap} apart")
@@ -175,8 +214,10 @@ class _Search:
         wide = pair_subsets.wide(self._matches, self._keypoints)
         yield self._from_pairs(wide, "from pairs whose matches cover their images")
         for seed in (self._seed + 1, self._seed + 2):
-            yield self._check(self._map(self._database, f"with seed {seed}", seed=seed), f"with seed {seed}")
-        yield from self._globally()
+            way = f"with seed {seed}"
+            yield self._check(self._map(self._database, way, seed=seed), way)
+        if not again:
+            yield from self._globally()
 
     @cached_property
     def _keypoints(self) -> dict[str, Points2D]:

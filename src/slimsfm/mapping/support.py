@@ -28,7 +28,7 @@ from scipy.sparse.csgraph import connected_components
 from slimsfm.arrays import Points2D
 from slimsfm.mapping.model import camera_of
 from slimsfm.mapping.pairs import Matches, in_order
-from slimsfm.mapping.parallax import share_without_parallax
+from slimsfm.mapping.parallax import centered, share_without_parallax
 from slimsfm.mapping.quality import MIN_COMMON_POINTS, ModelQuality
 
 Pair = tuple[str, str]
@@ -75,7 +75,7 @@ def measure(model: pycolmap.Reconstruction, matches: Matches, names: Iterable[st
         median_track_length=float(np.median(lengths or [0])),
         triangulation_angle_deg=_triangulation_angle(model),
         camera_spread=spread,
-        without_parallax=share_without_parallax(images, matches) if spread < _CLOSE else 0.0,
+        without_parallax=_without_parallax(images, matches) if spread < _CLOSE else 0.0,
         focal_lengths=_focal_lengths(images),
         pieces=_pieces(common),
     )
@@ -96,16 +96,29 @@ def agreement(images: Mapping[str, pycolmap.Image], matches: Matches) -> dict[Pa
     return found
 
 
+def _without_parallax(images: Mapping[str, pycolmap.Image], matches: Matches) -> float:
+    pixels = {name: centered(_pixels(image), camera_of(image)) for name, image in images.items()}
+    return share_without_parallax(pixels, matches)
+
+
+def _pixels(image: pycolmap.Image) -> Points2D:
+    return np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
+
+
 def _rays(image: pycolmap.Image) -> Points2D:
-    pixels = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
-    return np.asarray(camera_of(image).cam_from_img(pixels), np.float64).reshape(-1, 2)
+    return np.asarray(camera_of(image).cam_from_img(_pixels(image)), np.float64).reshape(-1, 2)
 
 
 def _agrees(
     a: pycolmap.Image, b: pycolmap.Image, rays_a: Points2D, rays_b: Points2D
 ) -> Bool[np.ndarray, " n"]:
-    essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
-    squared = pycolmap.compute_squared_sampson_error(rays_a, rays_b, essential)
+    b_from_a = b.cam_from_world() * a.cam_from_world().inverse()
+    if b_from_a.translation.any():
+        essential = pycolmap.essential_matrix_from_pose(b_from_a)
+        squared = pycolmap.compute_squared_sampson_error(rays_a, rays_b, essential)
+    else:  # the same photo twice: rays coincide
+        moved = np.column_stack([rays_a, np.ones(len(rays_a))]) @ b_from_a.rotation.matrix().T
+        squared = ((moved[:, :2] / moved[:, 2:] - rays_b) ** 2).sum(axis=1)
     cameras = camera_of(a), camera_of(b)
     allowed = max(_MAX_ERROR_PX * _scale(camera) / camera.mean_focal_length() for camera in cameras)
     return np.asarray(squared) < allowed**2
@@ -158,18 +171,26 @@ def _pieces(common: csr_array) -> tuple[int, ...]:
     return tuple(sorted(Counter(labels.tolist()).values(), reverse=True))
 
 
-def largest_piece(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The model without the images that hardly have a point in common with its largest piece."""
+def pieces_of(model: pycolmap.Reconstruction, *, min_images: int) -> list[pycolmap.Reconstruction]:
+    """The pieces of a model that hardly have a point in common, largest first, without small ones."""
     image_ids = sorted(model.reg_image_ids())
+    if len(image_ids) < min_images or not model.num_points3D():
+        return []
     names = [model.image(i).name for i in image_ids]
     _, labels = connected_components(_common_points(model, names) >= MIN_COMMON_POINTS)
-    largest = np.bincount(labels).argmax()
-    if np.all(labels == largest):
-        return model
+    counts = Counter(labels.tolist())
+    if len(counts) == 1:
+        return [model]
+    large = [label for label, count in counts.most_common() if count >= min_images]
+    return [
+        _piece(model, {i for i, own in zip(image_ids, labels, strict=True) if own == one}) for one in large
+    ]
+
+
+def _piece(model: pycolmap.Reconstruction, image_ids: set[int]) -> pycolmap.Reconstruction:
     kept = pycolmap.Reconstruction(model)
-    for image_id, label in zip(image_ids, labels.tolist(), strict=True):
-        if label != largest:
-            kept.deregister_frame(kept.image(image_id).frame_id)
+    for image_id in sorted(set(model.reg_image_ids()) - image_ids):
+        kept.deregister_frame(kept.image(image_id).frame_id)
     return kept
 
 

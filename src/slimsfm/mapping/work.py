@@ -10,6 +10,7 @@ import pycolmap
 from slimsfm.arrays import Image
 from slimsfm.features import Extractor, Features
 from slimsfm.geometry import Box
+from slimsfm.mapping.choice import PickedModel
 from slimsfm.mapping.extraction import CameraSharing
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
 from slimsfm.mapping.pairs import Matches, PairChoice
@@ -132,8 +133,8 @@ class MapParts:
     matches: Matches
     """Verified matches by pair of image names."""
 
-    notes: tuple[str, ...] = ()
-    """What the user should know about the choice of the model."""
+    picked: PickedModel | None = None
+    """The model as it was picked, with its support and what to say about it; None with known poses."""
 
     photos: Mapping[str, Image] = field(default_factory=dict)
     """Small photos by image name, for extractors without keypoints."""

@@ -200,7 +200,7 @@ class DetectorFree:
             model=made.model,
             features=made.features,
             matches=made.matches,
-            notes=made.notes,
+            picked=made.picked,
             photos={name: shrink_photo(photos[name], self.max_image_size) for name in made.features},
         )
 

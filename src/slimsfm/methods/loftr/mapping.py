@@ -17,7 +17,7 @@ from jaxtyping import Float64, Int64
 
 from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
-from slimsfm.mapping.choice import pick_model
+from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.extraction import color_points
 from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
 from slimsfm.mapping.reconstruction import reconstruct
@@ -217,8 +217,8 @@ class KeypointFreeModel:
     matches: Matches
     """Verified matches between these keypoints."""
 
-    notes: tuple[str, ...] = ()
-    """What the user should know about the choice of the model."""
+    picked: PickedModel | None = None
+    """The model as it was picked; None with known poses."""
 
 
 def build_without_keypoints(
@@ -255,7 +255,7 @@ def build_without_keypoints(
         ReconstructionError: No model can be reconstructed from the photos.
     """
     cells = match_without_keypoints(photos, pairs, matcher, masks, progress)
-    rough, notes, matches = _reconstruct(
+    rough, picked, matches = _reconstruct(
         cells, cameras, cam_from_world, workspace, number, split, seed, progress
     )
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
@@ -264,7 +264,7 @@ def build_without_keypoints(
     seen = refined.features.items()
     color_points(refined.model, {name: image_colors(photos[name], one.keypoints) for name, one in seen})
     return KeypointFreeModel(
-        model=refined.model, features=refined.features, matches=refined.matches(matches), notes=notes
+        model=refined.model, features=refined.features, matches=refined.matches(matches), picked=picked
     )
 
 
@@ -277,8 +277,8 @@ def _reconstruct(
     split: bool,
     seed: int,
     progress: ProgressBar,
-) -> tuple[pycolmap.Reconstruction, tuple[str, ...], Matches]:
-    """Reconstruct a model from cells; also returns notes on it, and the verified matches.
+) -> tuple[pycolmap.Reconstruction, PickedModel | None, Matches]:
+    """Reconstruct a model from cells; also returns how it was picked, and the verified matches.
 
     COLMAP's limits are in pixels, so images are scaled until a cell has 8 of them.
     """
@@ -290,15 +290,16 @@ def _reconstruct(
         camera.has_prior_focal_length |= cam_from_world is not None
     write_database(database, shrunk.features, small)
     verify_pairs(database, names, cells.matches, seed=seed, progress=progress)
-    notes: tuple[str, ...] = ()
+    picked = None
     if cam_from_world is not None:
         model = triangulate(database, names, workspace / "sfm", cam_from_world, seed=seed, progress=progress)
     else:
         models = reconstruct(database, names, workspace / "sfm", seed=seed, split=split, progress=progress)
-        model, notes = pick_model(models, number)
+        picked = pick_model(models, number)
+        model = picked.model
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=cam_from_world is not None)
-    return model, notes, matches
+    return model, picked, matches
 
 
 def _adjust(model: pycolmap.Reconstruction, scale_px: float) -> None:
