@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from commands import slimsfm, state
+from databases import write_features
 from slimsfm.mapping.hloc import write_hloc
 from slimsfm.mapping.io import read_map
 
@@ -32,16 +33,7 @@ def whole(boulder, tmp_path_factory) -> Project:
     (folder / "sparse").mkdir()
     (folder / "sfm").rename(folder / "sparse" / "0")
     shutil.copytree(boulder.photos, folder / "images")
-    with pycolmap.Database.open(folder / "database.db") as database:
-        for camera in map_.model.cameras.values():
-            database.write_camera(camera, use_camera_id=True)
-        for name, image in map_.images.items():
-            row = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
-            database.write_image(row, use_image_id=True)
-            database.write_keypoints(image.image_id, map_.features[name].keypoints)
-            data = map_.features[name].descriptors
-            sift = pycolmap.FeatureExtractorType.SIFT
-            database.write_descriptors(image.image_id, pycolmap.FeatureDescriptors(type=sift, data=data))
+    write_features(folder / "database.db", map_)
     np.savetxt(folder / "box3d_corners.txt", map_.box.corners)
     shutil.copytree(boulder.queries, folder / "queries")
     (folder / "queries.txt").write_text("night.png\nday.png\n")

@@ -3,9 +3,9 @@ import pickle
 from dataclasses import replace
 
 import numpy as np
-import pycolmap
 import pytest
 
+from databases import write_features
 from scenes import exact_map, like_sift, with_matches
 from slimsfm.datasets.base import map_object
 from slimsfm.datasets.reconstructed import Colmap
@@ -31,20 +31,6 @@ def project(tmp_path, truth, write_image):
         for name in truth.images:
             writer.write(name, truth.features[name])
     return Colmap(path=model, images=tmp_path / "photos", features=tmp_path / "features.h5")
-
-
-def write_database(path, map_):
-    with pycolmap.Database.open(path) as database:
-        for camera in map_.model.cameras.values():
-            database.write_camera(camera, use_camera_id=True)
-        for name, image in map_.images.items():
-            row = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
-            database.write_image(row, use_image_id=True)
-            database.write_keypoints(image.image_id, map_.features[name].keypoints)
-            descriptors = pycolmap.FeatureDescriptors(
-                type=pycolmap.FeatureExtractorType.SIFT, data=map_.features[name].descriptors
-            )
-            database.write_descriptors(image.image_id, descriptors)
 
 
 def assert_is_part_of(sequence, truth, names):
@@ -104,7 +90,7 @@ def test_a_wrong_list_is_named_in_the_error(project, making, tmp_path, text, mes
 
 @pytest.mark.parametrize("place", ["cup/sparse/0", "cup"])
 def test_descriptors_come_from_a_database_in_the_project(project, truth, making, tmp_path, place):
-    write_database(tmp_path / place / "database.db", truth)
+    write_features(tmp_path / place / "database.db", truth)
     made = replace(project, features=None).load("cup", making)
     assert "descriptors from its database" in made.truth.info.origin
 

@@ -17,7 +17,7 @@ from slimsfm.arrays import Mask, Points2D
 from slimsfm.errors import ModelError
 from slimsfm.features import Features
 from slimsfm.mapping.lens import PixelMap, fit_pixel_map
-from slimsfm.mapping.model import camera_of
+from slimsfm.mapping.model import camera_of, positions
 
 _EXACT_PX = 0.05  # single floats round by 0.001, text files by 0.005
 _ROUNDED_PX = 2.0  # whole pixels, rounded down, and an origin half a pixel away
@@ -144,11 +144,6 @@ def _pixels(image: pycolmap.Image, features: Features, unusable: Mask) -> _Pixel
         compared=near if near.sum() >= usable.sum() / 4 else usable,
         size_px=max(camera.width, camera.height),
     )
-
-
-def positions(image: pycolmap.Image) -> Points2D:
-    """The keypoints of an image of a model."""
-    return np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
 
 
 def _maps(pixels: list[_Pixels]) -> dict[str, PixelMap]:

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pycolmap
 
+from slimsfm.mapping.model import positions
 from slimsfm.mapping.sfm import adjust
 
 _ITERATIONS = 10  # of bundle adjustment; enough to see where focal lengths go
@@ -49,9 +50,8 @@ def with_own_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     for image in images:
         copy.add_camera_with_trivial_rig(own_camera(model.camera(image.camera_id), image.image_id))
     for image in images:
-        pixels = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
         moved = pycolmap.Image(
-            name=image.name, keypoints=pixels, camera_id=image.image_id, image_id=image.image_id
+            name=image.name, keypoints=positions(image), camera_id=image.image_id, image_id=image.image_id
         )
         copy.add_image_with_trivial_frame(moved, image.cam_from_world())
     for point3D_id, point in model.points3D.items():

@@ -10,10 +10,10 @@ from slimsfm.errors import ModelError
 from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.store import stored_name
-from slimsfm.mapping.agreement import Masks, counted, place_features, positions
+from slimsfm.mapping.agreement import Masks, counted, place_features
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.map import Map, MapInfo
-from slimsfm.mapping.model import camera_of, estimate_box, read_box, read_model
+from slimsfm.mapping.model import camera_of, estimate_box, positions, read_box, read_model
 from slimsfm.mapping.pairs import Matches
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.reprojection import check_reprojection

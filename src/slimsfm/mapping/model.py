@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
-from slimsfm.arrays import Ids, Points3D
+from slimsfm.arrays import Ids, Points2D, Points3D
 from slimsfm.errors import InputError, ModelError
 from slimsfm.geometry import Box
 from slimsfm.mapping.binary import MODEL_PARTS, check_binary
@@ -101,6 +101,11 @@ def _is_camera(camera: pycolmap.Camera) -> bool:
 
 def _num_track_elements(model: pycolmap.Reconstruction) -> int:
     return sum(point.track.length() for point in model.points3D.values())
+
+
+def positions(image: pycolmap.Image) -> Points2D:
+    """The keypoints of an image of a model."""
+    return np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
 
 
 def camera_of(image: pycolmap.Image) -> pycolmap.Camera:

@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from slimsfm.errors import ModelError
 from slimsfm.features import Features
 from slimsfm.mapping.map import Map
-from slimsfm.mapping.model import camera_of
+from slimsfm.mapping.model import camera_of, positions
 
 _TURNS_TO_STORED = {1: 0, 3: 2, 6: 3, 8: 1}  # of the upright picture, by EXIF orientation
 
@@ -144,10 +144,9 @@ def turned_model(model: pycolmap.Reconstruction, turns: Mapping[str, int]) -> py
     camera_ids = _add_cameras(made, model, kept, turns)
     for image in sorted(kept, key=lambda one: one.image_id):
         camera, turn = camera_of(image), turns[image.name]
-        keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
         copy = pycolmap.Image(
             name=image.name,
-            keypoints=turned_pixels(keypoints, (camera.width, camera.height), turn),
+            keypoints=turned_pixels(positions(image), (camera.width, camera.height), turn),
             camera_id=camera_ids[image.image_id],
             image_id=image.image_id,
         )

@@ -17,8 +17,8 @@ from slimsfm.errors import ImageError, ModelError
 from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.sift import Sift, root_sift
-from slimsfm.mapping.agreement import counted, positions
-from slimsfm.mapping.model import camera_of
+from slimsfm.mapping.agreement import counted
+from slimsfm.mapping.model import camera_of, positions
 from slimsfm.photos import Orientation, read_image
 from slimsfm.progress import ProgressBar
 

@@ -67,7 +67,7 @@ def map_incrementally(
         seed: Seed of every random choice.
         progress: Progress callback.
         label: What the progress is of.
-        start: A model to extend, of the same images and cameras. By default, mapping starts anew.
+        start: A model to extend, of the same images and cameras. By default, a new model is started.
 
     Returns:
         The models, which may share images; with a start, the extended model alone.

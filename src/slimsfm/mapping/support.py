@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slimsfm.arrays import Points2D
-from slimsfm.mapping.model import camera_of
+from slimsfm.mapping.model import camera_of, positions
 from slimsfm.mapping.pairs import Matches, in_order
 from slimsfm.mapping.parallax import centered, share_without_parallax
 from slimsfm.mapping.quality import MIN_COMMON_POINTS, ModelQuality
@@ -92,26 +92,23 @@ def agreement(images: Mapping[str, pycolmap.Image], matches: Matches) -> dict[Pa
         rows = matches[a, b]
         if a in images and b in images and len(rows):
             matched = rays[a][rows[:, 0]], rays[b][rows[:, 1]]
-            found[a, b] = float(_agrees(images[a], images[b], *matched).mean())
+            found[a, b] = float(near_epipolar_lines(images[a], images[b], *matched).mean())
     return found
 
 
 def _without_parallax(images: Mapping[str, pycolmap.Image], matches: Matches) -> float:
-    pixels = {name: centered(_pixels(image), camera_of(image)) for name, image in images.items()}
+    pixels = {name: centered(positions(image), camera_of(image)) for name, image in images.items()}
     return share_without_parallax(pixels, matches)
 
 
-def _pixels(image: pycolmap.Image) -> Points2D:
-    return np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
-
-
 def _rays(image: pycolmap.Image) -> Points2D:
-    return np.asarray(camera_of(image).cam_from_img(_pixels(image)), np.float64).reshape(-1, 2)
+    return np.asarray(camera_of(image).cam_from_img(positions(image)), np.float64).reshape(-1, 2)
 
 
-def _agrees(
+def near_epipolar_lines(
     a: pycolmap.Image, b: pycolmap.Image, rays_a: Points2D, rays_b: Points2D
 ) -> Bool[np.ndarray, " n"]:
+    """Which matches, given by their rays, lie within 4 px of the epipolar lines of two posed images."""
     b_from_a = b.cam_from_world() * a.cam_from_world().inverse()
     if b_from_a.translation.any():
         essential = pycolmap.essential_matrix_from_pose(b_from_a)

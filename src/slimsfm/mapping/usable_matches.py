@@ -8,16 +8,14 @@ from jaxtyping import Int64
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import ModelError
-from slimsfm.features import Features, shrink_factor
+from slimsfm.features import Features
 from slimsfm.mapping.agreement import Masks
 from slimsfm.mapping.model import camera_of
 from slimsfm.mapping.pairs import Matches
 from slimsfm.mapping.sources import Source
-from slimsfm.mapping.support import trusted_pairs
+from slimsfm.mapping.support import near_epipolar_lines, trusted_pairs
 
 _MIN_INLIERS = 15  # matches of a verified pair, as in COLMAP
-_MAX_EPIPOLAR_ERROR_PX = 4.0  # in pixels in which features were found
-_LONGEST_PX = {"max_image_size": 1600}  # hloc shrinks larger images to this or less before it finds features
 
 
 def usable_matches(
@@ -105,12 +103,5 @@ def _consistent(
         np.asarray(camera.cam_from_img(one.keypoints[rows].astype(np.float64)))
         for camera, one, rows in zip(cameras, features, pairs.T, strict=True)
     ]
-    b_from_a = images[1].cam_from_world() * images[0].cam_from_world().inverse()
-    essential = pycolmap.essential_matrix_from_pose(b_from_a)
-    squared = np.asarray(pycolmap.compute_squared_sampson_error(rays[0], rays[1], essential))
-    focal = min(
-        camera.mean_focal_length() / shrink_factor(_LONGEST_PX, camera.width, camera.height)
-        for camera in cameras
-    )
-    good = pairs[squared * focal**2 < _MAX_EPIPOLAR_ERROR_PX**2]
+    good = pairs[near_epipolar_lines(*images, *rays)]
     return good if len(good) >= _MIN_INLIERS else good[:0]
