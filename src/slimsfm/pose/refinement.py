@@ -5,14 +5,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.geometry import motions, project, reprojection_errors
 from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
 from slimsfm.pose.types import (
+    FOCAL,
     MIN_SIGMA_PX,
+    UNKNOWNS,
     FocalPrior,
+    FramePrior,
     Gravity,
     PoseEstimate,
     Prior,
@@ -23,6 +26,7 @@ from slimsfm.pose.types import (
 _ROUNDS = 8  # of choosing inliers; 2 to 4 are common
 _STEPS = 30  # of Levenberg-Marquardt per round; 5 are common
 _NEGLIGIBLE = 1e-6  # decrease of the cost that ends a round: a thousandth of a sigma
+_FARTHEST = 0.5  # change of an intrinsic per step
 _CAUCHY = 2.385  # scale of the loss in sigmas: 95 % efficiency if the errors were normal
 _EXACT_SIGMA_PX = 1e-3  # of exact matches; at zero the priors would weigh nothing
 _MINIMAL = 4  # matches that a pose and a focal length need
@@ -37,6 +41,7 @@ def refine_pose(
     *,
     max_error_px: float,
     focal: FocalPrior | None = None,
+    frame: FramePrior | None = None,
     gravity: Gravity | None = None,
 ) -> PoseEstimate:
     """Refine a pose by minimizing reprojection errors under a Cauchy loss.
@@ -55,25 +60,27 @@ def refine_pose(
         camera: Intrinsics of the image, of any model that has a focal length.
         max_error_px: Largest reprojection error of an inlier; at first, three sigmas.
         focal: Refine the focal length too, starting from the camera's; two focal lengths keep their ratio.
+        frame: Refine the principal point or the aspect ratio of the pixels too, or both.
         gravity: Direction of gravity.
 
     Returns:
         The pose, whatever its quality: check its inliers. It has no covariance if fewer than 4 matches agree.
     """
-    if focal is None and gravity is None:
+    if focal is None and frame is None and gravity is None:
         return _refine_by_matches(points2D, points3D_in_world, start_cam_from_world, camera, max_error_px)
-    priors = tuple(prior for prior in (focal, gravity) if prior is not None)
+    priors = tuple(prior for prior in (focal, frame, gravity) if prior is not None)
     problem = _Problem(
         pixels=points2D,
         in_world=points3D_in_world,
         sigma_px=max_error_px / 3,
         priors=priors,
-        free_focal=focal is not None,
+        free=_free(focal, frame),
     )
     start = _Fit(cam_from_world=start_cam_from_world, camera=camera)
     found = _refine_in_rounds(problem, start, max_error_px)
     if focal is None:
-        return replace(found, camera=None, relative_focal_sigma=None)
+        found = replace(found, relative_focal_sigma=None)
+        return found if frame else replace(found, camera=None)
     if found.camera is None or found.covariance is None:
         return found
     focal_px = found.camera.mean_focal_length()
@@ -81,7 +88,13 @@ def refine_pose(
     if limited_px == focal_px:
         return found
     at_limit = replace(start, camera=with_focal_length(camera, limited_px))
-    return _refine_in_rounds(replace(problem, free_focal=False), at_limit, max_error_px)
+    return _refine_in_rounds(replace(problem, free=_free(None, frame)), at_limit, max_error_px)
+
+
+def _free(focal: FocalPrior | None, frame: FramePrior | None) -> Bool[np.ndarray, "10"]:
+    """Which unknowns are free."""
+    center, aspect = (frame.center, frame.aspect) if frame else (False, False)
+    return np.array([*6 * (True,), focal is not None, center, center, aspect])
 
 
 def _refine_by_matches(
@@ -134,7 +147,7 @@ def _estimate(problem: "_Problem", fit: "_Fit", inliers: Mask) -> PoseEstimate:
         inliers=inliers,
         covariance=covariance[:6, :6],
         camera=fit.camera,
-        relative_focal_sigma=float(covariance[6, 6] ** 0.5),
+        relative_focal_sigma=float(covariance[FOCAL, FOCAL] ** 0.5),
     )
 
 
@@ -143,20 +156,16 @@ class _Fit:
     cam_from_world: pycolmap.Rigid3d
     camera: pycolmap.Camera
 
-    def moved(self, step: Float64[np.ndarray, "7"]) -> "_Fit":
+    def moved(self, step: Float64[np.ndarray, "10"]) -> "_Fit":
         motion = pycolmap.Rigid3d(pycolmap.Rotation3d(step[:3]), step[3:6])
-        focal_px = self.camera.mean_focal_length() * np.exp(np.clip(step[6], -0.5, 0.5))
-        return _Fit(
-            cam_from_world=motion * self.cam_from_world,
-            camera=with_focal_length(self.camera, focal_px) if step[6] else self.camera,
-        )
+        return _Fit(cam_from_world=motion * self.cam_from_world, camera=_changed(self.camera, step[FOCAL:]))
 
     def errors(self, points2D: Points2D, points3D_in_world: Points3D) -> Float64[np.ndarray, " n"]:
         return reprojection_errors(points2D, points3D_in_world, self.cam_from_world, self.camera)
 
     def jacobian(
         self, points3D_in_world: Points3D, pixels: Float64[np.ndarray, "n 2"]
-    ) -> Float64[np.ndarray, "n 2 7"]:
+    ) -> Float64[np.ndarray, "n 2 10"]:
         """`projection_jacobian` with distortion, and the change with the logarithm of the focal length.
 
         The derivative of the lens is taken by central differences; the rest is exact.
@@ -171,7 +180,26 @@ class _Fit:
         # a point that moves along its ray does not move in the image
         lens[:, :, 2] = -np.einsum("nij,nj->ni", lens[:, :, :2], in_cam[:, :2] / depths)
         center = self.camera.params[self.camera.principal_point_idxs()]
-        return np.concatenate([lens @ motions(in_cam), (pixels - center)[:, :, None]], axis=2)
+        from_center = pixels - center
+        shift = np.tile(self.camera.mean_focal_length() * np.eye(2), (len(in_cam), 1, 1))
+        stretch = from_center * (0.5, -0.5)
+        return np.concatenate(
+            [lens @ motions(in_cam), from_center[:, :, None], shift, stretch[:, :, None]], axis=2
+        )
+
+
+def _changed(camera: pycolmap.Camera, step: Float64[np.ndarray, "4"]) -> pycolmap.Camera:
+    """The camera with its intrinsics moved by a step: focal length, principal point, aspect ratio."""
+    if not step.any():
+        return camera
+    focal, x, y, aspect = np.clip(step, -_FARTHEST, _FARTHEST)
+    changed = with_focal_length(camera, camera.mean_focal_length() * np.exp(focal))
+    params = changed.params.copy()
+    params[camera.principal_point_idxs()] += camera.mean_focal_length() * np.array([x, y])
+    if aspect:
+        params[camera.focal_length_idxs()] *= np.exp([aspect / 2, -aspect / 2])
+    changed.params = params.tolist()
+    return changed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -180,7 +208,7 @@ class _Problem:
     in_world: Points3D
     sigma_px: float
     priors: tuple[Prior, ...]
-    free_focal: bool
+    free: Bool[np.ndarray, "10"]
 
     def of(self, inliers: Mask) -> "_Problem":
         return replace(self, pixels=self.pixels[inliers], in_world=self.in_world[inliers])
@@ -191,20 +219,19 @@ class _Problem:
 
     def information_and_gradient(
         self, fit: _Fit
-    ) -> tuple[Float64[np.ndarray, "7 7"], Float64[np.ndarray, "7"]]:
+    ) -> tuple[Float64[np.ndarray, "10 10"], Float64[np.ndarray, "10"]]:
         seen = project(self.in_world, fit.cam_from_world, fit.camera)
         residuals = (seen - self.pixels) / self.sigma_px
         jacobian = fit.jacobian(self.in_world, seen) / self.sigma_px
         weights = 1 / (1 + np.sum(residuals**2, axis=1) / _CAUCHY**2)
-        weighted = (weights[:, None, None] * jacobian).reshape(-1, 7)
-        information = weighted.T @ jacobian.reshape(-1, 7)
+        weighted = (weights[:, None, None] * jacobian).reshape(-1, UNKNOWNS)
+        information = weighted.T @ jacobian.reshape(-1, UNKNOWNS)
         gradient = weighted.T @ residuals.ravel()
         for prior in self.priors:
             rows = prior.rows(fit.cam_from_world, fit.camera)
             information += rows.jacobian.T @ rows.jacobian
             gradient += rows.jacobian.T @ rows.residuals
-        if not self.free_focal:
-            information[6], information[:, 6], gradient[6] = 0, 0, 0
+        information[~self.free], information[:, ~self.free], gradient[~self.free] = 0, 0, 0
         return information, gradient
 
 
@@ -237,13 +264,13 @@ def _scatter_px(errors: Float64[np.ndarray, " n"]) -> float:
 
 
 def _solve(
-    information: Float64[np.ndarray, "7 7"], gradient: Float64[np.ndarray, "7"], damping: float
-) -> Float64[np.ndarray, "7"]:
+    information: Float64[np.ndarray, "10 10"], gradient: Float64[np.ndarray, "10"], damping: float
+) -> Float64[np.ndarray, "10"]:
     diagonal = np.diag(information)
     return np.linalg.solve(information + np.diag(damping * diagonal + (diagonal == 0)), -gradient)
 
 
-def _inverse(information: Float64[np.ndarray, "7 7"]) -> Float64[np.ndarray, "7 7"]:
+def _inverse(information: Float64[np.ndarray, "10 10"]) -> Float64[np.ndarray, "10 10"]:
     """Covariance: zero for what is fixed, huge for what the matches leave free."""
     diagonal = np.diag(information)
     scales = np.sqrt(np.where(diagonal > 0, diagonal, np.inf))

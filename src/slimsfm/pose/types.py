@@ -35,7 +35,7 @@ class PoseEstimate:
     the pose was not verified."""
 
     camera: pycolmap.Camera | None = None
-    """The given camera with the estimated focal length; None where the focal length was known."""
+    """The given camera with the estimated intrinsics; None where none was estimated."""
 
     relative_focal_sigma: float | None = None
     """Standard deviation of the estimated focal length, divided by the focal length. Where the matches do not
@@ -122,6 +122,15 @@ def pose_covariance(
 _USUAL = 1.2  # focal length over the longer side, as COLMAP guesses
 _TRIED = (0.23, 5.3)  # over the longer side: fields of view of 130 to 11 degrees
 _POSSIBLE = (0.1, 10.0)  # over the longer side: COLMAP also rejects photographs beyond these
+_CROPPED = 0.2  # standard deviation of a crop's principal point, over the longer side
+_STRETCHED = 0.2  # standard deviation of the logarithm of a pixel's aspect ratio
+_WITH_TWO = {
+    "SIMPLE_PINHOLE": ("PINHOLE", 4),
+    "SIMPLE_RADIAL": ("OPENCV", 8),
+    "RADIAL": ("OPENCV", 8),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 8),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 8),
+}  # model with two focal lengths, and its number of parameters
 _STRIDE = 1.43  # ratio of successive focal lengths to try; an error of a fifth leaves a third of the inliers
 
 
@@ -135,6 +144,15 @@ def check_has_focal_length(camera: pycolmap.Camera) -> None:
         raise ValueError(f"camera must have a focal length, got the spherical model {camera.model_name}")
 
 
+UNKNOWNS = 10
+"""Number of unknowns of a refinement: a motion in the camera's frame (rotation in radians, then translation in
+map units), the logarithm of the focal length, a shift of the principal point in focal lengths, and the
+logarithm of the ratio of the two focal lengths."""
+
+FOCAL, CENTER, ASPECT = 6, slice(7, 9), 9
+"""Where the intrinsics are among the unknowns."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PriorRows:
     """Residuals of a prior at one pose and camera, and their derivative."""
@@ -142,9 +160,8 @@ class PriorRows:
     residuals: Float64[np.ndarray, " k"]
     """Deviations from the expected values, in standard deviations."""
 
-    jacobian: Float64[np.ndarray, "k 7"]
-    """Change of the residuals with a motion in the camera's frame (rotation in radians, then translation in
-    map units) and with the logarithm of the focal length."""
+    jacobian: Float64[np.ndarray, "k 10"]
+    """Change of the residuals with the unknowns, see `UNKNOWNS`."""
 
 
 @runtime_checkable
@@ -181,7 +198,7 @@ class Gravity:
         """The map's direction rotated into the camera, minus the camera's direction."""
         sigma = np.radians(self.uncertainty_deg)
         down = cam_from_world.rotation.matrix() @ _unit(self.in_world)
-        jacobian = np.zeros((3, 7))
+        jacobian = np.zeros((3, UNKNOWNS))
         jacobian[:, :3] = motions(down[None])[0, :, :3]
         return PriorRows(residuals=(down - _unit(self.in_cam)) / sigma, jacobian=jacobian / sigma)
 
@@ -248,7 +265,61 @@ class FocalPrior:
     def rows(self, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> PriorRows:  # noqa: ARG002
         """Logarithm of the camera's focal length, minus that of the expected focal length."""
         deviation = np.log(camera.mean_focal_length() / self.expected_px) / self.log_sigma
-        return PriorRows(residuals=np.array([deviation]), jacobian=np.eye(7)[6:] / self.log_sigma)
+        row = np.eye(UNKNOWNS)[FOCAL : FOCAL + 1] / self.log_sigma
+        return PriorRows(residuals=np.array([deviation]), jacobian=row)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FramePrior:
+    """Where the principal point and the pixel aspect ratio of a cropped or stretched image are expected."""
+
+    camera: pycolmap.Camera
+    """The camera of the image if it was neither cropped nor stretched."""
+
+    center: bool = True
+    """Whether the principal point may differ: about a fifth of the longer side."""
+
+    aspect: bool = False
+    """Whether the ratio of the focal lengths may differ: about a fifth. The camera must have two."""
+
+    @property
+    def center_sigma(self) -> float:
+        """Standard deviation of the principal point, in focal lengths."""
+        longer_px = max(self.camera.width, self.camera.height)
+        return _CROPPED * longer_px / self.camera.mean_focal_length()
+
+    def rows(self, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> PriorRows:  # noqa: ARG002
+        """Deviations of the principal point and of the logarithm of the aspect ratio."""
+        at, sigmas = camera.principal_point_idxs(), np.array([*2 * (self.center_sigma,), _STRETCHED])
+        center = (camera.params[at] - self.camera.params[at]) / camera.mean_focal_length()
+        changes = np.array([*center, log_aspect(camera) - log_aspect(self.camera)])
+        free = [self.center, self.center, self.aspect]
+        jacobian = np.eye(UNKNOWNS)[CENTER.start :] / sigmas[:, None]
+        return PriorRows(residuals=(changes / sigmas)[free], jacobian=jacobian[free])
+
+
+def log_aspect(camera: pycolmap.Camera) -> float:
+    """Logarithm of the ratio of the focal lengths in x and y; 0 for a camera with one."""
+    focal_px = camera.params[camera.focal_length_idxs()]
+    return float(np.log(focal_px[0] / focal_px[-1]))
+
+
+def with_two_focal_lengths(camera: pycolmap.Camera) -> pycolmap.Camera | None:
+    """An equal camera of a model with two focal lengths; None if there is no such model."""
+    if len(camera.focal_length_idxs()) == 2:
+        return camera
+    if camera.model_name not in _WITH_TWO:
+        return None
+    focal_px, *rest = camera.params.tolist()
+    model, count = _WITH_TWO[camera.model_name]
+    params = [focal_px, focal_px, *rest]
+    return pycolmap.Camera(
+        model=model,
+        width=camera.width,
+        height=camera.height,
+        params=[*params, *[0.0] * (count - len(params))],
+        camera_id=camera.camera_id,
+    )
 
 
 def with_focal_length(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
