@@ -167,7 +167,7 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
             name=name,
             path=folder / name,
             cameras={
-                key: query_camera(one.map, folder / name, camera, one.options.focal)
+                key: query_camera(one.map, folder / name, camera, one.options.focal).camera
                 for key, one in localizer.localizers.items()
             },
         )

@@ -1,6 +1,7 @@
 """What is known about a query image in advance: its intrinsics, and the direction of gravity."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,8 +14,13 @@ from slimsfm.exif import read_exif
 from slimsfm.mapping.map import Map
 from slimsfm.pose.types import Gravity
 
-FocalLength = Literal["known", "approximate", "unknown"]
-"""How well the focal length of a query is known. If it is not known, it is estimated with the pose."""
+FocalLength = Literal["auto", "known", "approximate", "unknown"]
+"""How well the focal length of a query is known. If it is not known, it is estimated with the pose. auto: as
+well as its source says, see `CameraSource`."""
+
+CameraSource = Literal["given", "map", "exif", "unknown"]
+"""Where the intrinsics of a query come from: given by the user, the camera of the map, EXIF data, or nowhere.
+The first two are known, EXIF is approximate."""
 
 _GUESS = 1.2  # focal length over the longer side, the default of COLMAP
 _SAME_FOCAL = 0.1  # relative difference below which EXIF means the map's camera, whose calibration is better
@@ -22,6 +28,20 @@ _SAME_FOCAL = 0.1  # relative difference below which EXIF means the map's camera
 
 class UnknownIntrinsicsError(ImageError):
     """Nothing says what the intrinsics of an image are, or what was given is for another image size."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class QueryCamera:
+    """The intrinsics of a query, and where they come from."""
+
+    camera: pycolmap.Camera
+    """The intrinsics, of the size of the image."""
+
+    source: CameraSource
+    """Where they come from; of the camera of an unknown source, only the size is known."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences that name the image, on what was ignored, such as an impossible focal length in EXIF."""
 
 
 def read_camera(path: str | Path) -> pycolmap.Camera:
@@ -84,17 +104,15 @@ def guess_camera(width: int, height: int) -> pycolmap.Camera:
 
 
 def query_camera(
-    map: Map, path: str | Path, given: pycolmap.Camera | None, focal: FocalLength = "known"
-) -> pycolmap.Camera:
+    map: Map, path: str | Path, given: pycolmap.Camera | None, focal: FocalLength = "auto"
+) -> QueryCamera:
     """Choose the intrinsics of a query image, read upright or as stored as the map says.
 
-    In this order: the given camera; the camera that all reference images share, unless EXIF gives another
-    focal length or the aspect ratio differs; the camera according to EXIF; a guess by `guess_camera`, if the
-    focal length need not be known.
+    In this order: the given camera; the map's camera; the camera according to EXIF; a guess by `guess_camera`.
 
     Raises:
-        UnknownIntrinsicsError: The given camera has another aspect ratio, or none is given and the focal
-            length must be known but is not.
+        UnknownIntrinsicsError: The given camera has another aspect ratio, or the focal length must be known
+            but nothing tells it.
         ImageError: The file is not an image.
         ValueError: `focal` is not a value of `FocalLength`.
     """
@@ -111,15 +129,43 @@ def query_camera(
             f"{given.width}x{given.height}; give the camera of this image"
         )
     if scaled and (given or not exif.has_prior_focal_length or _same_focal(exif, scaled)):
-        return scaled
+        return QueryCamera(camera=scaled, source="given" if given else "map")
     if exif.has_prior_focal_length:
-        return exif
+        return QueryCamera(camera=exif, source="exif")
     if focal == "known":
         raise UnknownIntrinsicsError(
             f"{path}: its focal length is unknown ({found.problem}, and not taken with the map's camera); "
             "give `camera=FILE`, or estimate it with `focal='unknown'`"
         )
-    return guess_camera(exif.width, exif.height)
+    return QueryCamera(camera=guess_camera(exif.width, exif.height), source="unknown")
+
+
+def camera_in_memory(map: Map, width: int, height: int, given: pycolmap.Camera | None = None) -> QueryCamera:
+    """Choose the intrinsics of an image of which only the size is known.
+
+    Args:
+        map: The map.
+        width: Width of the image, in pixels.
+        height: Height of the image, in pixels.
+        given: Intrinsics to use; they must be of this size.
+
+    Returns:
+        The given camera; else the one camera of the map that has this aspect ratio; else a guess.
+
+    Raises:
+        ValueError: The given camera has another size, or the size is not positive.
+    """
+    if given is not None and (given.width, given.height) != (width, height):
+        raise ValueError(
+            f"camera must have the image's size {width}x{height}, got {given.width}x{given.height}"
+        )
+    if given is not None:
+        return QueryCamera(camera=given, source="given")
+    shared = map.shared_camera
+    scaled = shared and scaled_camera(shared, width, height)
+    if scaled:
+        return QueryCamera(camera=scaled, source="map")
+    return QueryCamera(camera=guess_camera(width, height), source="unknown")
 
 
 def _same_focal(a: pycolmap.Camera, b: pycolmap.Camera) -> bool:

@@ -261,7 +261,7 @@ def _track_all(
 def _camera_of(map: Map, source: str, frame: VideoFrame, given: pycolmap.Camera | None) -> pycolmap.Camera:
     """The intrinsics of all frames, from the first: given, of the map, or from EXIF."""
     if Path(source).is_dir():
-        return query_camera(map, Path(source) / frame.name, given)
+        return query_camera(map, Path(source) / frame.name, given, "known").camera
     height, width = frame.image.shape[:2]
     known = given or map.shared_camera
     camera = known and scaled_camera(known, width, height)
