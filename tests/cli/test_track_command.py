@@ -141,7 +141,7 @@ def test_a_more_confident_pose_has_a_stronger_box(boulder, images):
             cam_from_world=sure.pose.cam_from_world, inliers=sure.pose.inliers, confidence=confidence
         )
         one = sure.__class__(localization=_with_pose(sure.localization, pose), state="tracked", seconds=0.1)
-        drawn = draw_tracked(images[0], one, map_.box, camera)
+        drawn = draw_tracked(images[0], one, map_.box)
         changes.append(np.abs(drawn.astype(int) - images[0]).sum())
     assert changes[0] > 1.5 * changes[1] > 2 * changes[2] > 0
 

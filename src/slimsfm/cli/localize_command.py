@@ -61,8 +61,8 @@ def localize(
     writer_for(output, several=bool(also))
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")
-    if gravity and (also or localization.focal != "known"):
-        raise InputError("gravity goes with one map and a known focal length; leave out also or focal")
+    if gravity and also:
+        raise InputError("gravity goes with one map; leave out also")
     localizers = {name: Localizer(read_map(path), localization) for name, path in _named(map, *also).items()}
     check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
     given = read_camera(camera) if camera else None

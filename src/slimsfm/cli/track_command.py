@@ -10,7 +10,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
-from slimsfm.errors import InputError
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
@@ -50,8 +49,6 @@ def track(
     """
     watch = Stopwatch()
     networks.apply()
-    if localization.focal != "known":
-        raise InputError("tracking needs a known focal length; use `focal='known'` and `camera=FILE`")
     for path in (output, video) if video else (output,):
         check_output(path, map, Path(source), camera, overwrite=overwrite)
     writer_for(output)

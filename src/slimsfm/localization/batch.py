@@ -13,7 +13,7 @@ from slimsfm.arrays import GrayImage, Image
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.features import Features
 from slimsfm.image_files import check_names, list_images
-from slimsfm.localization.cameras import query_camera
+from slimsfm.localization.cameras import QueryCamera, query_camera
 from slimsfm.localization.localizer import Localization, Localizer
 from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
@@ -40,7 +40,7 @@ class MultiLocalizer:
     def localize(
         self,
         image: Image,
-        cameras: Mapping[str, pycolmap.Camera | None] | None = None,
+        cameras: Mapping[str, pycolmap.Camera | QueryCamera | None] | None = None,
         gravity: Gravity | None = None,
         mask: GrayImage | None = None,
     ) -> dict[str, Localization]:
@@ -106,11 +106,8 @@ def localize_images(
     Raises:
         InputError: There is no image.
         ImageError: An image cannot be read, or its intrinsics are not known well enough.
-        ValueError: `workers` is below 1, or `gravity` is given with a focal length that is not known.
+        ValueError: `workers` is below 1.
     """
-    focal = localizer.options.focal
-    if gravity and focal != "known":
-        raise ValueError(f"gravity needs a known focal length, got focal={focal!r}")
     multi = MultiLocalizer({_ONLY: localizer})
     return _localize(multi, Path(images), camera, gravity or {}, workers, progress)[_ONLY]
 
@@ -137,7 +134,7 @@ def localize_objects(
 class _Task(NamedTuple):
     name: str
     path: Path
-    cameras: Mapping[str, pycolmap.Camera]
+    cameras: Mapping[str, QueryCamera]
 
 
 def _localize(
@@ -167,7 +164,7 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
             name=name,
             path=folder / name,
             cameras={
-                key: query_camera(one.map, folder / name, camera, one.options.focal).camera
+                key: query_camera(one.map, folder / name, camera, one.options.focal)
                 for key, one in localizer.localizers.items()
             },
         )

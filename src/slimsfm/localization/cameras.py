@@ -108,7 +108,7 @@ def query_camera(
 ) -> QueryCamera:
     """Choose the intrinsics of a query image, read upright or as stored as the map says.
 
-    In this order: the given camera; the map's camera; the camera according to EXIF; a guess by `guess_camera`.
+    In this order: the given camera; the map's; that of EXIF; a guess by `guess_camera`.
 
     Raises:
         UnknownIntrinsicsError: The given camera has another aspect ratio, or the focal length must be known

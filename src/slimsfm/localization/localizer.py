@@ -11,7 +11,12 @@ from slimsfm.arrays import GrayImage, Image, Points2D, Points3D
 from slimsfm.errors import MapError
 from slimsfm.features import Features, load_extractor, shrink_factor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
-from slimsfm.localization.cameras import FocalLength, guess_camera, scaled_camera
+from slimsfm.localization.cameras import (
+    CameraSource,
+    FocalLength,
+    QueryCamera,
+    camera_in_memory,
+)
 from slimsfm.localization.matching import extract_near
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
@@ -47,9 +52,10 @@ class LocalizationOptions:
     ransac: RansacOptions = RansacOptions()
     """How the pose is estimated."""
 
-    focal: FocalLength = "known"
-    """Whether the focal length of the queries is known, known to 30 % (approximate), or unknown. If it is not
-    known, it is estimated together with the pose."""
+    focal: FocalLength = "auto"
+    """How far the focal length of the queries is believed. auto: as its source says, and it is estimated
+    together with the pose where it is not known or where the matches contradict it. known: as it is, without
+    correction. approximate: to 30 %. unknown: not at all."""
 
     min_confidence: float = 0.5
     """Poses of lower confidence are discarded: the query counts as not localized."""
@@ -125,7 +131,10 @@ class Localization:
     """Pose of the camera; None if the query could not be localized."""
 
     camera: pycolmap.Camera
-    """The intrinsics, with the estimated focal length if it was not known."""
+    """The intrinsics, with those that were estimated."""
+
+    camera_source: CameraSource = "given"
+    """Where the intrinsics come from, apart from those that were estimated."""
 
     points2D: Points2D
     """Pixels of the 2D-3D matches that the pose was estimated from."""
@@ -144,6 +153,11 @@ class Localization:
 
     orientation: Orientation = "upright"
     """Which pixels of the image the pose is of: as in the map."""
+
+    @property
+    def camera_estimated(self) -> tuple[str, ...]:
+        """Which intrinsics were estimated: "focal length", "principal point", "pixel aspect ratio"."""
+        return self.pose.estimated if self.pose else ()
 
     @property
     def num_matches(self) -> int:
@@ -171,7 +185,7 @@ class Localizer:
     def localize(
         self,
         image: Image,
-        camera: pycolmap.Camera | None = None,
+        camera: pycolmap.Camera | QueryCamera | None = None,
         gravity: Gravity | None = None,
         mask: GrayImage | None = None,
     ) -> Localization:
@@ -181,8 +195,7 @@ class Localizer:
             image: RGB, upright or as stored as the map says (`read_image(path, map.info.orientation)`).
             camera: Its intrinsics. Default: the camera of the map, scaled to the image, if all reference
                 images share one of the same aspect ratio. A guess suffices if the focal length is not known.
-            gravity: Direction of gravity in the map and in the image, as a phone measures it; used only if
-                the focal length is known.
+            gravity: Direction of gravity in the map and in the image, as a phone measures it.
             mask: Of the size of the image; features where it is 0 are not used.
 
         Raises:
@@ -191,11 +204,14 @@ class Localizer:
         camera = self.camera_of(image, camera)
         start = perf_counter()
         features = self.extractor.extract(image, mask)
-        seconds, query = perf_counter() - start, self._query(features, camera, image)
-        return self._localization(query, self._search.run(query, camera, gravity), seconds)
+        seconds, query = perf_counter() - start, self._query(features, camera.camera, image)
+        return self._localization(query, self._search.run(query, camera, gravity), camera, seconds)
 
     def localize_near(
-        self, image: Image, camera: pycolmap.Camera | None, near_cam_from_world: pycolmap.Rigid3d
+        self,
+        image: Image,
+        camera: pycolmap.Camera | QueryCamera | None,
+        near_cam_from_world: pycolmap.Rigid3d,
     ) -> Localization:
         """Localize one image of approximately known pose, such as the next frame of a video.
 
@@ -216,10 +232,11 @@ class Localizer:
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
-        found = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera)
-        seconds, query = perf_counter() - start, self._query(found.features, camera, image)
+        found = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera.camera)
+        seconds, query = perf_counter() - start, self._query(found.features, camera.camera, image)
         query = replace(query, shrink_factor=found.shrink_factor)
-        return self._localization(query, self._search.near(query, camera, near_cam_from_world), seconds)
+        searched = self._search.near(query, camera, near_cam_from_world)
+        return self._localization(query, searched, camera, seconds)
 
     @property
     def looks_at_images(self) -> bool:
@@ -229,7 +246,7 @@ class Localizer:
     def localize_features(
         self,
         features: Features,
-        camera: pycolmap.Camera,
+        camera: pycolmap.Camera | QueryCamera,
         gravity: Gravity | None = None,
         image: Image | None = None,
     ) -> Localization:
@@ -241,20 +258,25 @@ class Localizer:
             gravity: As in `localize`.
             image: RGB, as in `localize`; needed only if `looks_at_images`.
         """
-        query = self._query(features, camera, image)
-        return self._localization(query, self._search.run(query, camera, gravity), 0.0)
+        camera = _given(camera)
+        query = self._query(features, camera.camera, image)
+        return self._localization(query, self._search.run(query, camera, gravity), camera, 0.0)
 
-    def rounds(self, features: Features, camera: pycolmap.Camera) -> Iterator[RoundResult]:
+    def rounds(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> Iterator[RoundResult]:
         """Run all rounds of the strategy, without stopping early."""
-        return self._search.rounds(self._query(features, camera), camera)
+        camera = _given(camera)
+        return self._search.rounds(self._query(features, camera.camera), camera)
 
-    def _localization(self, query: Query, found: SearchResult, extract_seconds: float) -> Localization:
+    def _localization(
+        self, query: Query, found: SearchResult, camera: QueryCamera, extract_seconds: float
+    ) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
         if found.best.confidence < self.options.min_confidence:
             pose = evidence = None
         return Localization(
             pose=pose,
             camera=found.best.camera,
+            camera_source=camera.source,
             points2D=matches.pixels(query),
             points3D_in_world=self.map.points3D_in_world[matches.points],
             references=found.references,
@@ -282,27 +304,28 @@ class Localizer:
             shrink_factor=shrink_factor(self.extractor.options, camera.width, camera.height),
         )
 
-    def camera_of(self, image: Image, given: pycolmap.Camera | None = None) -> pycolmap.Camera:
-        """Intrinsics of an image: those given, else those of the map, scaled, else a guess if that suffices.
+    def camera_of(self, image: Image, given: pycolmap.Camera | QueryCamera | None = None) -> QueryCamera:
+        """Intrinsics of an image, see `camera_in_memory`.
 
         Args:
             image: RGB, as in `localize`.
             given: Intrinsics to use.
 
         Raises:
-            ValueError: The given camera has another image size, or none is given and the map's does not fit.
+            ValueError: The given camera has another image size, or the focal length must be known but none is
+                given and the map's does not fit.
         """
         height, width = image.shape[:2]
-        shared = self.map.shared_camera
-        camera = given or (shared and scaled_camera(shared, width, height))
-        if camera is None and self.options.focal != "known":
-            camera = guess_camera(width, height)
-        if camera is None:
+        if isinstance(given, QueryCamera):
+            camera_in_memory(self.map, width, height, given.camera)  # checks the size
+            return given
+        found = camera_in_memory(self.map, width, height, given)
+        if found.source == "unknown" and self.options.focal == "known":
             raise ValueError(
                 f"camera must be given: the map has no single camera for an image of {width}x{height} pixels"
             )
-        if (camera.width, camera.height) != (width, height):
-            raise ValueError(
-                f"camera must have the image's size {width}x{height}, got {camera.width}x{camera.height}"
-            )
-        return camera
+        return found
+
+
+def _given(camera: pycolmap.Camera | QueryCamera) -> QueryCamera:
+    return camera if isinstance(camera, QueryCamera) else QueryCamera(camera=camera, source="given")

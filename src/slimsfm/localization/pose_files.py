@@ -108,6 +108,10 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
             "covariance": one.pose and _covariance_to_json(one.pose),
             "orientation": one.orientation,
             "focal_length_px": one.camera.mean_focal_length(),
+            "camera_source": one.camera_source,
+            "camera_estimated": list(one.camera_estimated),
+            "position_bound_95": one.pose and one.pose.position_bound,
+            "rotation_bound_95_deg": one.pose and one.pose.rotation_bound_deg,
             "inliers": one.pose.num_inliers if one.pose else 0,
             "matches": one.num_matches,
             "references_tried": one.references,
@@ -119,6 +123,8 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
         "cam_from_world: x_in_cam = R @ x_in_world + t; quaternions are x, y, z, w; "
         "confidence: probability of a corner error below a tenth of the box's diagonal; "
         "predicted_corner_error: over the diagonal; "
+        "position_bound_95 (map units), rotation_bound_95_deg: hold with 95 % probability; "
+        "camera_source: given, map, exif or unknown; camera_estimated: intrinsics that the matches gave; "
         "covariance: of a turn (radians) and then a shift (map units) in the camera's frame; "
         "orientation: whether the camera is that of the upright image or of its stored pixels"
     )

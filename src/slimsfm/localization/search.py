@@ -8,14 +8,14 @@ from typing import NamedTuple
 import pycolmap
 
 from slimsfm.geometry import project, resized_camera
-from slimsfm.localization.cameras import FocalLength
+from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
 from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
-from slimsfm.pose.types import with_focal_length
+from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
 
 SURE = 0.95
 """Confidence from which a pose is sure."""
@@ -29,6 +29,10 @@ ACCURATE = 0.006
 SETTLED = 0.8
 """Share of the previous round's predicted error above which further matches no longer help much."""
 
+TRUSTED: tuple[CameraSource, ...] = ("given", "map")
+"""Sources of intrinsics that are taken as known as long as no matches contradict them."""
+
+_MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 
 
@@ -81,7 +85,7 @@ class Search:
     """Searches one map with one strategy."""
 
     def __init__(
-        self, map: Map, strategy: Strategy, ransac: RansacOptions, focal: FocalLength = "known"
+        self, map: Map, strategy: Strategy, ransac: RansacOptions, focal: FocalLength = "auto"
     ) -> None:
         self._map = map
         self._strategy = strategy
@@ -89,30 +93,39 @@ class Search:
         self._focal: FocalLength = focal
         self._verifier = Verifier(map, strategy, distinct_points(map))
 
-    def run(self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None) -> SearchResult:
+    def run(self, query: Query, camera: QueryCamera, gravity: Gravity | None = None) -> SearchResult:
         """Localize a query; stop at the first round that suffices."""
         rounds: list[RoundResult] = []
         for one in self.rounds(query, camera, gravity):
             rounds.append(one)
             if _suffices(rounds):
-                break
+                return _summed(rounds)
+        if rounds and self._focal == "auto" and camera.source in TRUSTED:
+            rounds.append(self._with_any_focal_length(query, rounds[-1], camera))
         return _summed(rounds)
 
-    def near(
-        self, query: Query, camera: pycolmap.Camera, near_cam_from_world: pycolmap.Rigid3d
-    ) -> SearchResult:
+    def _with_any_focal_length(self, query: Query, last: RoundResult, camera: QueryCamera) -> RoundResult:
+        """The last round again, as if nobody knew the focal length; the round itself if that is no better."""
+        unknown = replace(camera, source="unknown")
+        again = self._result(query, last.matches, unknown, perf_counter())
+        inliers = [one.pose.num_inliers if one.pose else 0 for one in (last, again)]
+        is_better = inliers[1] > _MORE * inliers[0] and again.confidence > last.confidence
+        return again if is_better else replace(last, match_seconds=0.0, pose_seconds=again.pose_seconds)
+
+    def near(self, query: Query, camera: QueryCamera, near_cam_from_world: pycolmap.Rigid3d) -> SearchResult:
         """Localize a query of approximately known pose: match points near where they project."""
         start = perf_counter()
         if isinstance(self._strategy, PoseGuided):
             matches = self._strategy.near(query, near_cam_from_world)
         else:
             target = self._strategy.visible_points(near_cam_from_world)
-            pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
-            matches = match_near(query, target, pixels, camera, self._map.descriptor_metric)
+            points3D = self._map.points3D_in_world[target[1]]
+            pixels = project(points3D, near_cam_from_world, camera.camera)
+            matches = match_near(query, target, pixels, camera.camera, self._map.descriptor_metric)
         return _summed([self._result(query, matches, camera, start)])
 
     def rounds(
-        self, query: Query, camera: pycolmap.Camera, gravity: Gravity | None = None
+        self, query: Query, camera: QueryCamera, gravity: Gravity | None = None
     ) -> Iterator[RoundResult]:
         """Run all rounds of the strategy."""
         matching, pose = self._strategy.rounds(query), None
@@ -130,39 +143,54 @@ class Search:
         self,
         query: Query,
         matches: PointMatches,
-        camera: pycolmap.Camera,
+        camera: QueryCamera,
         start: float,
         gravity: Gravity | None = None,
     ) -> RoundResult:
         matched = perf_counter()
-        shrunk = _Shrunk.of(query, matches, camera)
-        posed = self._estimate(shrunk.query, shrunk.matches, shrunk.camera, gravity)
-        pose, evidence = posed.pose, None
+        shrunk = _Shrunk.of(query, matches, camera.camera)
+        pose = self._estimate(shrunk, camera.source, gravity)
+        estimated, evidence = camera.camera, None
         if pose is not None:
-            evidence = self._verifier.evidence(shrunk.query, shrunk.matches, pose, posed.camera)
-            pose = replace(
-                pose,
-                confidence=evidence.confidence,
-                camera=pose.camera and shrunk.enlarged(pose.camera, camera),
-            )
+            used = pose.camera or shrunk.camera
+            evidence = self._verifier.evidence(shrunk.query, shrunk.matches, pose, used)
+            if pose.camera is not None:
+                estimated = shrunk.enlarged(pose.camera)
+            whole = pose.camera and estimated
+            pose = replace(pose, confidence=evidence.confidence, camera=whole)
         return RoundResult(
             matches=matches,
             pose=pose,
-            camera=camera if posed.camera is shrunk.camera else shrunk.enlarged(posed.camera, camera),
+            camera=estimated,
             evidence=evidence,
             match_seconds=matched - start,
             pose_seconds=perf_counter() - matched,
         )
 
     def _estimate(
-        self, query: Query, matches: PointMatches, camera: pycolmap.Camera, gravity: Gravity | None
-    ) -> "_Posed":
-        points2D, points3D = matches.pixels(query), self._map.points3D_in_world[matches.points]
+        self, shrunk: "_Shrunk", source: CameraSource, gravity: Gravity | None
+    ) -> PoseEstimate | None:
+        """The pose, with the intrinsics as far as they are believed; those that do not fit are estimated."""
+        points2D = shrunk.matches.pixels(shrunk.query)
+        points3D = self._map.points3D_in_world[shrunk.matches.points]
+        focal = self._prior(shrunk.camera, source)
+        pose = estimate_pose(points2D, points3D, shrunk.camera, self._ransac, focal=focal, gravity=gravity)
+        if pose is None:
+            return None
+        pose = pose if focal is None else replace(pose, estimated=(FOCAL_LENGTH,))
         if self._focal == "known":
-            return _Posed(estimate_pose(points2D, points3D, camera, self._ransac, gravity=gravity), camera)
-        focal = FocalPrior.of(camera, _APPROXIMATE if self._focal == "approximate" else None)
-        pose = estimate_pose(points2D, points3D, camera, self._ransac, focal=focal)
-        return _Posed(pose, camera if pose is None or pose.camera is None else pose.camera)
+            return with_check(points2D, points3D, pose, shrunk.camera, self._ransac)
+        return fit_camera(points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal)
+
+    def _prior(self, camera: pycolmap.Camera, source: CameraSource) -> FocalPrior | None:
+        """What is expected of the focal length; None where it is known."""
+        if self._focal == "known" or (self._focal == "auto" and source in TRUSTED):
+            return None
+        if self._focal == "unknown" or source == "unknown":
+            return FocalPrior.of(camera)
+        return (
+            FocalPrior.of(camera, _APPROXIMATE) if self._focal == "approximate" else FocalPrior.near(camera)
+        )
 
 
 class _Shrunk(NamedTuple):
@@ -171,28 +199,28 @@ class _Shrunk(NamedTuple):
     query: Query
     matches: PointMatches
     camera: pycolmap.Camera
+    whole: pycolmap.Camera
     factor: float
 
     @classmethod
     def of(cls, query: Query, matches: PointMatches, camera: pycolmap.Camera) -> "_Shrunk":
         factor = min(query.shrink_factor, max(matches.shrink_factor, 1.0))
         if factor == 1:
-            return cls(query, matches, camera, factor)
+            return cls(query, matches, camera, camera, factor)
         if matches.points2D is not None:
             matches = replace(matches, points2D=matches.points2D / factor)
         small = resized_camera(camera, 1 / factor)
-        return cls(replace(query, keypoints=query.keypoints / factor, camera=small), matches, small, factor)
+        return cls(
+            replace(query, keypoints=query.keypoints / factor, camera=small), matches, small, camera, factor
+        )
 
-    def enlarged(self, estimated: pycolmap.Camera, whole: pycolmap.Camera) -> pycolmap.Camera:
-        """The intrinsics of the image, with the focal length that was estimated for the shrunk one."""
+    def enlarged(self, estimated: pycolmap.Camera) -> pycolmap.Camera:
+        """The intrinsics of the image, from those that were estimated for the shrunk one."""
         if self.factor == 1:
             return estimated
-        return with_focal_length(whole, self.factor * estimated.mean_focal_length())
-
-
-class _Posed(NamedTuple):
-    pose: PoseEstimate | None
-    camera: pycolmap.Camera
+        enlarged = resized_camera(estimated, self.factor)
+        enlarged.width, enlarged.height = self.whole.width, self.whole.height
+        return enlarged
 
 
 def _suffices(rounds: list[RoundResult]) -> bool:

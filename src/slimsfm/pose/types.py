@@ -1,7 +1,7 @@
 """A pose estimate, and the priors that can go into it: focal length and direction of gravity."""
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +13,22 @@ from slimsfm.geometry import Box, motions
 
 MIN_SIGMA_PX = 0.5
 """Smallest standard deviation of a keypoint that a covariance assumes: no detector is more accurate."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraCheck:
+    """What matches say about the intrinsics of an image."""
+
+    decreases: dict[str, float]
+    """By how much the squared errors, in sigmas, would decrease if each of the intrinsics changed."""
+
+    changes: dict[str, float]
+    """By how much each would change: the logarithm of the focal length, the principal point in focal lengths,
+    the logarithm of the aspect ratio."""
+
+    growth: Float64[np.ndarray, "6 6"]
+    """What adds to the covariance of the pose if nothing but the matches says what focal length and principal
+    point are: large where a wrong camera could not be noticed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,10 +58,40 @@ class PoseEstimate:
     determine it, as on a wall seen from the front, it is about as large as that of the prior. None where the
     focal length was known."""
 
+    estimated: tuple[str, ...] = ()
+    """Names of the intrinsics that were estimated with the pose: "focal length", "principal point", "pixel
+    aspect ratio"."""
+
+    check: CameraCheck | None = None
+    """What the matches say about the intrinsics. None where they were not checked."""
+
     @property
     def num_inliers(self) -> int:
         """Number of matches that agree with the pose."""
         return int(self.inliers.sum())
+
+    @property
+    def position_bound(self) -> float | None:
+        """Distance, in map units, within which the camera truly is with 95 % probability."""
+        return None if self.covariance is None else bound_95(self.covariance[3:, 3:])
+
+    @property
+    def rotation_bound_deg(self) -> float | None:
+        """Angle within which the true rotation is with 95 % probability, at most 180."""
+        if self.covariance is None:
+            return None
+        return float(min(np.degrees(bound_95(self.covariance[:3, :3])), 180.0))
+
+    def corner_bound(self, box: Box) -> float:
+        """Relative corner error that the pose does not exceed with 95 % probability.
+
+        Raises:
+            ValueError: The pose has no covariance.
+        """
+        if self.covariance is None:
+            raise ValueError("covariance must not be None to bound an error; estimate_pose computes it")
+        moved = motions(self.cam_from_world * box.corners).reshape(24, 6) / np.sqrt(8)
+        return bound_95(moved @ self.covariance @ moved.T) / box.diagonal
 
     def predicted_corner_error(self, box: Box) -> float:
         """Predict the relative corner error, assuming that the inliers are correct.
@@ -62,6 +108,19 @@ class PoseEstimate:
         moved = motions(self.cam_from_world * box.corners)
         squares = np.einsum("nia,ab,nib->n", moved, self.covariance, moved)
         return float(np.sqrt(np.maximum(squares, 0)).mean() / box.diagonal)
+
+
+def bound_95(covariance: Float64[np.ndarray, "k k"]) -> float:
+    """Length that a normally distributed vector of mean zero does not exceed with 95 % probability.
+
+    The squared length is taken for a multiple of a chi-squared variable of the same mean and variance, whose
+    quantile is that of Wilson and Hilferty; within 2 % of the exact one.
+    """
+    mean, square = np.trace(covariance), np.sum(covariance * covariance.T)
+    if not mean > 0:
+        return 0.0
+    part = 2 * square / (9 * mean**2)  # 2 / 9 over the degrees of freedom
+    return float(np.sqrt(mean) * (1 - part + _NORMAL_95 * np.sqrt(part)) ** 1.5)
 
 
 def rms_corner_errors(
@@ -122,6 +181,8 @@ def pose_covariance(
 _USUAL = 1.2  # focal length over the longer side, as COLMAP guesses
 _TRIED = (0.23, 5.3)  # over the longer side: fields of view of 130 to 11 degrees
 _POSSIBLE = (0.1, 10.0)  # over the longer side: COLMAP also rejects photographs beyond these
+_NORMAL_95 = 1.6449  # quantile of the normal distribution
+_EXIF_SIGMA = 0.15  # standard deviation of the logarithm of a focal length from EXIF
 _CROPPED = 0.2  # standard deviation of a crop's principal point, over the longer side
 _STRETCHED = 0.2  # standard deviation of the logarithm of a pixel's aspect ratio
 _WITH_TWO = {
@@ -145,8 +206,8 @@ def check_has_focal_length(camera: pycolmap.Camera) -> None:
 
 
 UNKNOWNS = 10
-"""Number of unknowns of a refinement: a motion in the camera's frame (rotation in radians, then translation in
-map units), the logarithm of the focal length, a shift of the principal point in focal lengths, and the
+"""Number of unknowns of a refinement: a motion in the camera's frame (rotation in radians, then translation
+in map units), the logarithm of the focal length, a shift of the principal point in focal lengths, and the
 logarithm of the ratio of the two focal lengths."""
 
 FOCAL, CENTER, ASPECT = 6, slice(7, 9), 9
@@ -260,6 +321,22 @@ class FocalPrior:
             log_sigma=np.log(2),
             limits_px=(_POSSIBLE[0] * longer_px, _POSSIBLE[1] * longer_px),
             tried_px=_grid(_TRIED[0] * longer_px, _TRIED[1] * longer_px, _USUAL * longer_px),
+        )
+
+    @classmethod
+    def near(cls, camera: pycolmap.Camera) -> "FocalPrior":
+        """Expect a focal length near that of a camera, to 15 %, but allow any: as EXIF data say.
+
+        Raises:
+            ValueError: As in `of`.
+        """
+        anywhere, expected_px = cls.of(camera), camera.mean_focal_length()
+        low_px, high_px = (limit * max(camera.width, camera.height) for limit in (min(_TRIED), max(_TRIED)))
+        return replace(
+            anywhere,
+            expected_px=expected_px,
+            log_sigma=_EXIF_SIGMA,
+            tried_px=_grid(min(low_px, expected_px / 2), max(high_px, 2 * expected_px), expected_px),
         )
 
     def rows(self, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> PriorRows:  # noqa: ARG002

@@ -19,8 +19,7 @@ from slimsfm.errors import ImageError, InputError
 from slimsfm.files import uninterrupted
 from slimsfm.geometry import BOX_EDGES, Box, project
 from slimsfm.localization import Localizer
-from slimsfm.localization.cameras import query_camera, scaled_camera
-from slimsfm.mapping.map import Map
+from slimsfm.localization.cameras import QueryCamera, camera_in_memory, query_camera, scaled_camera
 from slimsfm.photos import read_image, shrink
 from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 from slimsfm.tracking.video import FrameSource, VideoFrame, open_frames, write_video
@@ -211,7 +210,7 @@ def track_video(
         return _track_all(localizer, tracker, source, frames, camera, write, progress)
 
 
-def draw_tracked(image: Image, tracked: Tracked, box: Box, camera: pycolmap.Camera) -> Image:
+def draw_tracked(image: Image, tracked: Tracked, box: Box) -> Image:
     """Draw the box of the object into a frame, with the confidence of the pose as opacity.
 
     Returns:
@@ -221,6 +220,7 @@ def draw_tracked(image: Image, tracked: Tracked, box: Box, camera: pycolmap.Came
         return image
     boxed = image.copy()
     thickness = max(2, round(max(image.shape) / 320))
+    camera = tracked.localization.camera
     draw_box(boxed, box, tracked.pose.cam_from_world, camera, TRUE_RGB, thickness=thickness)
     confidence = tracked.pose.confidence
     opacity = 1.0 if confidence is None else max(confidence, _FAINTEST)
@@ -244,12 +244,12 @@ def _track_all(
     camera = None
     try:
         for frame in progress(frames):
-            camera = camera or _camera_of(localizer.map, source, frame, given)
-            _check_size(frame, camera)
+            camera = camera or _camera_of(localizer, source, frame, given)
+            _check_size(frame, camera.camera)
             with uninterrupted() if frames.is_live else nullcontext():
-                results[frame.name] = tracker.track(frame.image, camera)
+                tracked = results[frame.name] = tracker.track(frame.image, camera)
                 if write:
-                    write(draw_tracked(frame.image, results[frame.name], localizer.map.box, camera))
+                    write(draw_tracked(frame.image, tracked, localizer.map.box))
     except KeyboardInterrupt:
         if not (frames.is_live and results):
             raise
@@ -258,19 +258,26 @@ def _track_all(
     return results
 
 
-def _camera_of(map: Map, source: str, frame: VideoFrame, given: pycolmap.Camera | None) -> pycolmap.Camera:
-    """The intrinsics of all frames, from the first: given, of the map, or from EXIF."""
+def _camera_of(
+    localizer: Localizer, source: str, frame: VideoFrame, given: pycolmap.Camera | None
+) -> QueryCamera:
+    """The intrinsics of all frames, from the first, in the order of `query_camera`."""
+    focal = localizer.options.focal
     if Path(source).is_dir():
-        return query_camera(map, Path(source) / frame.name, given, "known").camera
+        return query_camera(localizer.map, Path(source) / frame.name, given, focal)
     height, width = frame.image.shape[:2]
-    known = given or map.shared_camera
-    camera = known and scaled_camera(known, width, height)
-    if camera is None:
-        reason = "its focal length is unknown"
-        if given:
-            reason = f"but the given camera has {given.width}x{given.height}"
-        raise InputError(f"{source}: {width}x{height} pixels, {reason}; give `camera=FILE` of this video")
-    return camera
+    scaled = given and scaled_camera(given, width, height)
+    if given and scaled is None:
+        raise InputError(
+            f"{source}: {width}x{height} pixels, but the given camera has {given.width}x{given.height}; "
+            "give `camera=FILE` of this video"
+        )
+    found = camera_in_memory(localizer.map, width, height, scaled)
+    if found.source == "unknown" and focal == "known":
+        raise InputError(
+            f"{source}: {width}x{height} pixels, focal length unknown; give `camera=FILE` of this video"
+        )
+    return found
 
 
 def _check_size(frame: VideoFrame, camera: pycolmap.Camera) -> None:

@@ -213,7 +213,7 @@ class LiveView:
         options = LocalizationOptions(focal=self.queries.focal)
         map_, path = self.maps[shown].map, self.queries.folder / name
         image = self.queries.read(name, map_.info.orientation)
-        camera = query_camera(map_, path, self.queries.camera, options.focal).camera
+        camera = query_camera(map_, path, self.queries.camera, options.focal)
         if shown not in self._localizers:
             self._localizers[shown] = Localizer(map_, options)
         return image, self._localizers[shown].localize(image, camera)

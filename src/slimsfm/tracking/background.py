@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from slimsfm.arrays import Image, Points2D, Points3D
 from slimsfm.geometry import Box, corner_error, reprojection_errors
 from slimsfm.localization import Localization, Localizer, Seconds
+from slimsfm.localization.cameras import QueryCamera
 from slimsfm.pose import refine_pose
 from slimsfm.tracking.templates import GrayFrame
 from slimsfm.tracking.track import MAX_CORNER_ERROR, Track
@@ -47,7 +48,7 @@ class Relocalizer:
         self._last_cam_from_world = last_cam_from_world
         self._next, self._pause = frame_index, 1
 
-    def localize(self, frame_index: int, image: Image, camera: pycolmap.Camera) -> Localization:
+    def localize(self, frame_index: int, image: Image, camera: QueryCamera) -> Localization:
         """Localize a frame, searching all of it or only near the last pose, as the schedule says."""
         if frame_index >= self._next:
             self._next = frame_index + self._pause
@@ -65,10 +66,11 @@ class Relocalizer:
         return replace(found, pose=None, predicted_corner_error=None)
 
 
-def _nothing(camera: pycolmap.Camera) -> Localization:
+def _nothing(camera: QueryCamera) -> Localization:
     return Localization(
         pose=None,
-        camera=camera,
+        camera=camera.camera,
+        camera_source=camera.source,
         points2D=np.zeros((0, 2)),
         points3D_in_world=np.zeros((0, 3)),
         references=0,

@@ -11,6 +11,7 @@ from slimsfm.arrays import Image, Points2D
 from slimsfm.features import shrink_factor
 from slimsfm.geometry import corner_error, resized_camera
 from slimsfm.localization import Localization, Localizer, Seconds
+from slimsfm.localization.cameras import QueryCamera
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking.background import BackgroundLocalization, BackgroundResult, Relocalizer, is_ambiguous
 from slimsfm.tracking.templates import (
@@ -105,8 +106,8 @@ class Tracker:
     """Tracks one object through the frames of a video; equal frames give equal poses.
 
     While the object is in sight, each frame is tracked from the one before, and now and then a frame is
-    localized on another thread. When the object is lost, frames are localized at once. The localizer must
-    treat the focal length as known.
+    localized on another thread. When the object is lost, frames are localized at once. The intrinsics that
+    the first localization estimates are kept.
     """
 
     def __init__(self, localizer: Localizer, options: TrackerOptions = TrackerOptions()) -> None:
@@ -119,40 +120,47 @@ class Tracker:
         self._confidence: float | None = None
         self._smoothed_cam_from_world: pycolmap.Rigid3d | None = None
         self._frame_index = -1
+        self._estimated: pycolmap.Camera | None = None
 
-    def track(self, image: Image, camera: pycolmap.Camera | None = None) -> Tracked:
+    def track(self, image: Image, camera: pycolmap.Camera | QueryCamera | None = None) -> Tracked:
         """Find the pose of the camera in the next frame.
 
         Args:
             image: RGB, upright or as stored as the map says.
-            camera: Intrinsics of the frame; by default those of the map, if all reference images share a
-                camera and the sizes agree up to a common scale.
+            camera: Intrinsics of the frame, see `Localizer.localize`.
 
         Raises:
-            ValueError: No camera is given and the map's cannot be used, or the camera has another size.
+            ValueError: As in `Localizer.localize`.
         """
         start = perf_counter()
         self._frame_index += 1
-        camera = self._localizer.camera_of(image, camera)
-        frame = to_gray_frame(image, camera, self._options.max_image_size)
+        believed = self._believed(image, camera)
+        frame = to_gray_frame(image, believed.camera, self._options.max_image_size)
         track = self._followed(frame)
         if track:
             near = track.pose.cam_from_world
             # copy, because the caller may reuse the memory for the next frame
-            localize = partial(self._localizer.localize_near, image.copy(), camera, near)
+            localize = partial(self._localizer.localize_near, image.copy(), believed, near)
             self._background.start_if_due(self._frame_index, track, localize)
-            state, localization = "tracked", self._as_localization(track, camera, perf_counter() - start)
+            state, localization = "tracked", self._as_localization(track, believed, perf_counter() - start)
         else:
             if self._track:
                 self._relocalizer.mark_lost(self._frame_index, self._track.pose.cam_from_world)
-            localization = self._unambiguous(self._relocalizer.localize(self._frame_index, image, camera))
-            track = self._begun(localization, frame)
+            localization = self._unambiguous(self._relocalizer.localize(self._frame_index, image, believed))
+            track = self._begun(localization, image)
             state = "localized" if track else "lost"
             if track:
                 self._background.restart(self._frame_index, track)
         self._track = track
         localization = replace(localization, orientation=self._localizer.map.info.orientation)
         return Tracked(localization=self._smoothed(localization), state=state, seconds=perf_counter() - start)
+
+    def _believed(self, image: Image, camera: pycolmap.Camera | QueryCamera | None) -> QueryCamera:
+        """The intrinsics of a frame: those that were estimated for a frame of its size, else as usual."""
+        known = self._estimated
+        if known and (known.width, known.height) == image.shape[1::-1]:
+            return QueryCamera(camera=known, source="given")
+        return self._localizer.camera_of(image, camera)
 
     def _followed(self, frame: GrayFrame) -> Track | None:
         """The track in the next frame, with new templates if a background result is due; None if lost."""
@@ -189,11 +197,14 @@ class Tracker:
         small = resized_camera(camera, 1 / factor)
         return is_ambiguous(points2D / factor, points3D, pose.cam_from_world, small, self._box)
 
-    def _begun(self, localization: Localization, frame: GrayFrame) -> Track | None:
-        """The track that begins with a localized frame; None where the localization has no pose."""
+    def _begun(self, localization: Localization, image: Image) -> Track | None:
+        """The track that begins with a localized image; None where the localization has no pose."""
         pose = localization.pose
         if pose is None:
             return None
+        if pose.estimated:
+            self._estimated = localization.camera
+        frame = to_gray_frame(image, localization.camera, self._options.max_image_size)
         points2D, templates = self._templates(localization, pose, frame)
         self._confidence = pose.confidence
         return begin_track(templates, points2D, frame, pose)
@@ -208,13 +219,14 @@ class Tracker:
         rows = spread_over_cells(points2D, points3D, self._options.max_points, cell_px)
         return points2D[rows], cut_templates(frame, points2D[rows], points3D[rows], pose.cam_from_world)
 
-    def _as_localization(self, track: Track, camera: pycolmap.Camera, seconds: float) -> Localization:
+    def _as_localization(self, track: Track, camera: QueryCamera, seconds: float) -> Localization:
         seen, confidence = track.seen, self._confidence
         if confidence is not None:
             confidence *= min(1.0, len(seen.rows) / (_SURE_SHARE * seen.num_expected))
         return Localization(
             pose=replace(track.pose, confidence=confidence),
-            camera=camera,
+            camera=camera.camera,
+            camera_source=camera.source,
             points2D=seen.points2D / track.frame.scale,
             points3D_in_world=track.templates.points3D_in_world[seen.rows],
             references=0,
