@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from jaxtyping import Int32, UInt8
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, VideoError
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from av import VideoFrame as Decoded
     from av.container import InputContainer
     from av.video.stream import VideoStream
+
+RGB = UInt8[np.ndarray, "_ _ 3"]
+"""An image whose result may have another size."""
 
 _MAX_PIXEL_ASPECT = 4  # width over height of a pixel, or its inverse; beyond, the file is wrong
 _MAX_MISSING_S = 0.5  # by which a film may end before the time that its file states
@@ -55,9 +59,9 @@ def open_film(path: Path) -> tuple[InputContainer, VideoStream]:
         one for one in container.streams.video if not one.disposition & av.stream.Disposition.attached_pic
     ]
     if not films:
-        only = ", only a cover picture" if container.streams.video else ""
+        what = "no film, only a cover picture" if container.streams.video else "no images"
         container.close()
-        raise InputError(f"{path}: contains no film{only}")
+        raise InputError(f"{path}: contains {what}")
     best = container.streams.best("video")
     return container, best if best in films else films[0]
 
@@ -107,11 +111,14 @@ def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[Decoded
 def _as_shown(frame: Decoded, stream: VideoStream) -> Image:
     aspect = stream.sample_aspect_ratio or stream.codec_context.sample_aspect_ratio
     image = with_square_pixels(frame.to_ndarray(format="rgb24"), aspect)
-    matrix = frame.side_data.get(pyav().sidedata.sidedata.Type.DISPLAYMATRIX)
+    try:
+        matrix = frame.side_data.get("DISPLAYMATRIX")
+    except ValueError:  # PyAV does not know all kinds of side data, for example of stereo films
+        return np.ascontiguousarray(np.rot90(image, round(frame.rotation / 90)))
     return image if matrix is None else displayed(image, np.frombuffer(bytes(matrix), np.int32))
 
 
-def with_square_pixels(image: Image, aspect: Fraction | None) -> Image:
+def with_square_pixels(image: RGB, aspect: Fraction | None) -> RGB:
     """Widen the axis along which pixels are longer until they are square.
 
     Args:
@@ -127,7 +134,7 @@ def with_square_pixels(image: Image, aspect: Fraction | None) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
-def displayed(image: Image, matrix: np.ndarray) -> Image:
+def displayed(image: RGB, matrix: Int32[np.ndarray, " 9"]) -> RGB:
     """Rotate and mirror an image as a display matrix says, to the nearest of the eight ways.
 
     Args:
