@@ -4,7 +4,8 @@
     ├── InputError              a file, folder or argument given by the user cannot be used
     │   ├── ImageError          ... because an image cannot be read
     │   ├── ModelError          ... because a COLMAP model is damaged or incomplete
-    │   └── MapError            ... because a map is damaged, incomplete or of a later format
+    │   ├── MapError            ... because a map is damaged, incomplete or of a later format
+    │   └── VideoError          ... to its end, because a video is damaged or cut off or changes its size
     ├── OutputError             a result cannot be written where the user asked
     │   └── OutputExistsError   ... because it exists and may not be overwritten
     ├── ReconstructionError     Structure from Motion found no model in the images
@@ -33,6 +34,10 @@ class ModelError(InputError):
 
 class MapError(InputError):
     """A map is damaged, incomplete or of a later format."""
+
+
+class VideoError(InputError):
+    """A video cannot be read to its end: it is damaged or cut off, or its size changes."""
 
 
 class OutputError(SlimsfmError):

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from commands import contents, slimsfm
+from slimsfm.cli import run
 from slimsfm.localization import Localizer
 from slimsfm.photos import read_image
 from slimsfm.report.frames import draw_tracked
@@ -129,6 +130,44 @@ def test_the_box_is_drawn_where_the_object_is_found(boulder, video, images, tmp_
     changes = [np.abs(a.astype(int) - b).max(axis=2) for a, b in zip(frames, images, strict=True)]
     assert all(np.mean(change > 60) > 0.002 for change in changes[:3])
     assert changes[3].max() < 30  # lost: no box
+
+
+def test_poses_carry_the_time_of_their_frame(boulder, video, tmp_path):
+    for name in ("poses.json", "poses.tum"):
+        assert slimsfm("track", boulder.map_path, video, "-o", tmp_path / name).code == 0
+    times = [index / 25 for index in range(6)]
+    rows = json.loads((tmp_path / "poses.json").read_text())["images"]
+    assert [row["seconds"] for row in rows] == times
+    trajectory = np.loadtxt(tmp_path / "poses.tum")
+    assert trajectory[:, 0].tolist() == [times[index] for index in (0, 1, 2, 4, 5)]  # 3 is lost
+
+
+def test_a_damaged_film_gives_the_poses_until_then_and_says_so(boulder, images, tmp_path):
+    film = tmp_path / "film.mjpeg"
+    smaller = [cv2.resize(images[0], (240, 180))]
+    film.write_bytes(b"".join(_jpeg(image) for image in [*images[:3], *smaller]))
+    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "drawn.mp4")
+    done = slimsfm("track", boulder.map_path, film, *arguments)
+    assert (done.code, done.err) == (0, "")
+    warnings = [line for line in done.out.splitlines() if line.startswith("warning: ")]
+    assert warnings == [
+        f"warning: {film}: ends before frame 3, which has 240x180 pixels; the frames before have 320x240"
+    ]
+    poses = poses_of(tmp_path / "poses.json")
+    assert list(poses) == ["000000", "000001", "000002"]
+    assert all(poses.values())
+    assert len(list(open_frames(tmp_path / "drawn.mp4").pictures)) == 3
+
+
+def _jpeg(image):
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def test_progress_is_plain_lines_without_a_terminal(boulder, video, tmp_path, capsys):
+    assert run(["track", str(boulder.map_path), str(video), "-o", str(tmp_path / "poses.json")]) == 0
+    first, last = capsys.readouterr().err.splitlines()
+    assert first == "track: 0 of 6"
+    assert last.startswith("track: 6 of 6 in ")
 
 
 def test_a_more_confident_pose_has_a_stronger_box(boulder, images):

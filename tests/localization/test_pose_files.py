@@ -98,6 +98,32 @@ def test_tum_holds_the_poses_by_index(results, tmp_path, name):
     assert_equal_poses({names[int(row[0])]: rigid(row[4:8], row[1:4]).inverse() for row in table})
 
 
+def test_poses_of_frames_carry_their_times(results, tmp_path):
+    seconds = dict(zip(TRUTH, [0.0, 0.04, 0.05, 0.3, 1.0], strict=True))
+    for name in ("poses.json", "poses.csv", "poses.tum"):
+        write_poses(tmp_path / name, results, seconds=seconds)
+    data = json.loads((tmp_path / "poses.json").read_text())
+    assert {image["name"]: image["seconds"] for image in data["images"]} == seconds
+    assert "seconds: when" in data["convention"]
+    with (tmp_path / "poses.csv").open(newline="") as file:
+        assert {row["name"]: float(row["seconds"]) for row in csv.DictReader(file)} == seconds
+    assert (tmp_path / "poses.tum").read_text().startswith("# seconds tx ")
+    assert np.loadtxt(tmp_path / "poses.tum")[:, 0].tolist() == [seconds[name] for name in FOUND]
+
+
+@pytest.mark.parametrize("times", [[None] * 5, [0.0, 0.1, None, 0.3, 0.4], [0.0, 0.1, 0.1, 0.2, 0.3]])
+def test_a_trajectory_counts_frames_whose_times_are_unknown_or_do_not_increase(results, tmp_path, times):
+    write_poses(tmp_path / "plain.tum", results)
+    write_poses(tmp_path / "poses.tum", results, seconds=dict(zip(TRUTH, times, strict=True)))
+    assert (tmp_path / "poses.tum").read_bytes() == (tmp_path / "plain.tum").read_bytes()
+
+
+def test_poses_without_times_have_no_seconds(results, tmp_path):
+    for name in ("poses.json", "poses.csv"):
+        write_poses(tmp_path / name, results)
+        assert "seconds" not in (tmp_path / name).read_text()
+
+
 def test_colmap_reads_images_txt(results, tmp_path):
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera())

@@ -4,9 +4,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
 from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
@@ -14,6 +11,7 @@ from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
 from slimsfm.mapping.io import read_map
+from slimsfm.progress import counted, shown
 from slimsfm.report.frames import track_video
 from slimsfm.tracking import Tracked, TrackerOptions
 from slimsfm.tracking.video import FrameSource, VideoFrame, check_format
@@ -56,22 +54,26 @@ def track(
         check_format(video)
     given = read_camera(camera) if camera else None
     localizer = Localizer(read_map(map), localization)
-    results = track_video(
+    tracked = track_video(
         localizer, source, tracker, camera=given, video=video, overwrite=overwrite, progress=_shown
     )
-    write_poses(output, {name: one.localization for name, one in results.items()}, overwrite=overwrite)
-    _sum_up(output, list(results.values()))
-    finish(f"{video or output}: {plural(len(results), 'frame')}", watch)
+    frames = tracked.frames
+    poses = {name: one.localization for name, one in frames.items()}
+    seconds = {name: one.frame_seconds for name, one in frames.items()}
+    write_poses(output, poses, seconds=seconds, overwrite=overwrite)
+    _sum_up(output, list(frames.values()))
+    if tracked.ended_early:
+        console.print(f"warning: {tracked.ended_early}", style="bold red", markup=False)
+    finish(f"{video or output}: {plural(len(frames), 'frame')}", watch)
 
 
 def _shown(frames: FrameSource) -> Iterator[VideoFrame]:
-    """The frames, with a bar and their rate on standard error."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task("track", total=frames.count)
-        for frame in frames.pictures:
+    """The frames, with progress on standard error: their number, or the time where it is not known."""
+    with counted(shown, frames.count or 1, "track") as advance_to:
+        for number, frame in enumerate(frames.pictures, start=1):
             yield frame
-            bars.update(task, advance=1, description=f"track {bars.tasks[0].speed or 0:.0f}/s")
+            advance_to(number if frames.count else 0)
+        advance_to(frames.count or 1)
 
 
 def _sum_up(output: Path, results: Sequence[Tracked]) -> None:

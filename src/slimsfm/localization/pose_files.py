@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable, Iterable, Mapping
+from itertools import count, pairwise
 from pathlib import Path
 from typing import TextIO
 
@@ -19,24 +20,40 @@ Results = Mapping[str, Localization]
 ObjectResults = Mapping[str, Results]
 """The same by name of the object, if images were searched for several."""
 
-_Row = tuple[dict[str, str], Localization]
-"""Object (if there are several) and name of a query, and its outcome."""
+_Row = tuple[dict[str, str | float | None], Localization]
+"""Object (if there are several), name and (if it is a frame) time of a query, and its outcome."""
 
 
-def write_poses(path: str | Path, results: Results, *, overwrite: bool = False) -> None:
+def write_poses(
+    path: str | Path,
+    results: Results,
+    *,
+    seconds: Mapping[str, float | None] | None = None,
+    overwrite: bool = False,
+) -> None:
     """Write poses in the format that the name of the file asks for.
 
-    - `.json` and `.csv` hold every query, localized or not, with times.
+    - `.json` and `.csv` hold every query, localized or not, and how long it took.
     - `images.txt` holds the localized queries in COLMAP's format, which has no names with spaces.
     - Any other `.txt`, and `.tum`, holds the localized queries as a TUM trajectory: one line
-      `index tx ty tz qx qy qz qw` per pose of a camera in the world; the index counts all queries.
+      `index tx ty tz qx qy qz qw` per pose of a camera in the world; the index counts all queries. Where all
+      queries have a time, and the times increase, the time replaces the index.
+
+    Args:
+        path: The file to write.
+        results: Outcome of each query.
+        seconds: Time of each query in its video, by name, for the frames of a video. It is `seconds` in
+            `.json` and `.csv`; `images.txt` has no times.
+        overwrite: Whether to replace an existing file.
 
     Raises:
         OutputError: The suffix is unknown, the format cannot hold a name, or the file exists or cannot be
             written.
     """
     check_names_for(path, results)
-    _write(Path(path), [({"name": name}, one) for name, one in results.items()], overwrite=overwrite)
+    times = {name: {"seconds": seconds[name]} if seconds else {} for name in results}
+    rows: list[_Row] = [({"name": name, **times[name]}, one) for name, one in results.items()]
+    _write(Path(path), rows, overwrite=overwrite)
 
 
 def write_object_poses(path: str | Path, results: ObjectResults, *, overwrite: bool = False) -> None:
@@ -48,7 +65,7 @@ def write_object_poses(path: str | Path, results: ObjectResults, *, overwrite: b
     path = Path(path)
     writer_for(path, several=True)
     names = dict.fromkeys(name for of_object in results.values() for name in of_object)
-    rows = [
+    rows: list[_Row] = [
         ({"object": key, "name": name}, of_object[name])
         for name in names
         for key, of_object in results.items()
@@ -128,6 +145,8 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
         "covariance: of a turn (radians) and then a shift (map units) in the camera's frame; "
         "orientation: whether the camera is that of the upright image or of its stored pixels"
     )
+    if any("seconds" in label for label, _ in rows):
+        convention += "; seconds: when the frame of a video is shown"
     json.dump({"convention": convention, "images": images}, file, indent=2)
     file.write("\n")
 
@@ -176,8 +195,12 @@ def _pixels(rows: list[_Row]) -> str:
 
 
 def _write_tum(file: TextIO, rows: list[_Row]) -> None:
-    file.write(f"# index tx ty tz qx qy qz qw of the cameras of {_pixels(rows)}\n")
-    for index, (_, one) in enumerate(rows):
+    seconds = [label.get("seconds") for label, _ in rows]
+    known = [one for one in seconds if isinstance(one, float)]
+    timed = len(known) == len(rows) and all(before < after for before, after in pairwise(known))
+    first = "seconds" if timed else "index"
+    file.write(f"# {first} tx ty tz qx qy qz qw of the cameras of {_pixels(rows)}\n")
+    for index, (_, one) in zip(known if timed else count(), rows, strict=False):
         if one.pose:
             world_from_cam = one.pose.cam_from_world.inverse()
             values = [*world_from_cam.translation, *world_from_cam.rotation.quat]

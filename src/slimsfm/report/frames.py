@@ -4,7 +4,7 @@ import base64
 import io
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
-from slimsfm.errors import ImageError, InputError
+from slimsfm.errors import ImageError, InputError, VideoError
 from slimsfm.files import uninterrupted
 from slimsfm.geometry import BOX_EDGES, Box, project
 from slimsfm.localization import Localizer
@@ -172,6 +172,17 @@ FrameProgress = Callable[[FrameSource], Iterator[VideoFrame]]
 _FAINTEST = 0.2  # opacity of the box under a pose that cannot be trusted
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackedVideo:
+    """Result of tracking an object through a video."""
+
+    frames: dict[str, Tracked]
+    """The outcome of each frame, by the name of the frame, in the order of the frames."""
+
+    ended_early: str | None = None
+    """Why the video could not be read to its end; None where it was."""
+
+
 def track_video(
     localizer: Localizer,
     source: str | Path,
@@ -181,10 +192,11 @@ def track_video(
     video: str | Path | None = None,
     overwrite: bool = False,
     progress: FrameProgress = lambda frames: frames.pictures,
-) -> dict[str, Tracked]:
+) -> TrackedVideo:
     """Track an object through all frames of a video.
 
-    An interruption ends the frames of a live camera, and what was tracked is returned.
+    An interruption ends the frames of a live camera, damage or a change of size those of a video file, and
+    what was tracked is returned.
 
     Args:
         localizer: Localizer of the map. It must assume a known focal length.
@@ -196,11 +208,11 @@ def track_video(
         progress: Progress callback.
 
     Returns:
-        The outcome of each frame, by the name of the frame, in the order of the frames.
+        The outcome of each frame.
 
     Raises:
-        InputError: The source cannot be read or has no frame, its focal length is unknown, or its frames
-            differ in size.
+        InputError: The source cannot be read or has no frame, its focal length is unknown, or the images of
+            a folder differ in size.
         OutputError: The video cannot be written.
     """
     source, tracker = str(source), Tracker(localizer, options)
@@ -235,27 +247,30 @@ def _track_all(
     given: pycolmap.Camera | None,
     write: Callable[[Image], None] | None,
     progress: FrameProgress,
-) -> dict[str, Tracked]:
+) -> TrackedVideo:
     """Track and write frame by frame.
 
     A frame of a live camera is finished before an interruption: poses and video end with the same frame.
     """
     results: dict[str, Tracked] = {}
-    camera = None
+    camera, ended_early = None, None
     try:
         for frame in progress(frames):
             camera = camera or _camera_of(localizer, source, frame, given)
             _check_size(frame, camera.camera)
             with uninterrupted() if frames.is_live else nullcontext():
-                tracked = results[frame.name] = tracker.track(frame.image, camera)
+                tracked = replace(tracker.track(frame.image, camera), frame_seconds=frame.seconds)
+                results[frame.name] = tracked
                 if write:
                     write(draw_tracked(frame.image, tracked, localizer.map.box))
+    except VideoError as error:
+        ended_early = str(error)
     except KeyboardInterrupt:
         if not (frames.is_live and results):
             raise
     if not results:
         raise InputError("the video has no frames")
-    return results
+    return TrackedVideo(frames=results, ended_early=ended_early)
 
 
 def _camera_of(

@@ -86,6 +86,9 @@ class Tracked:
     seconds: float
     """Time from the decoded frame to the pose."""
 
+    frame_seconds: float | None = None
+    """When the frame is shown in its video; None where that is unknown."""
+
     @property
     def pose(self) -> PoseEstimate | None:
         """Pose of the camera; None where the object was not found.

@@ -4,11 +4,12 @@ Videos need PyAV, which the extra `video` installs.
 """
 
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
-from types import ModuleType
+from time import perf_counter
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from slimsfm.errors import InputError, OutputError
 from slimsfm.files import replacing
 from slimsfm.image_files import list_images
 from slimsfm.photos import Orientation, read_image
+from slimsfm.tracking.film import film_pictures, open_film, pyav
 
 VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """Container formats of the videos that can be written, by suffix."""
@@ -36,13 +38,18 @@ class VideoFrame:
     image: Image
     """RGB."""
 
+    seconds: float | None = None
+    """When the frame is shown, as the file says; of a camera, the time since its first frame. None for images
+    of a folder and where the file has no times."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameSource:
     """Frames in the order in which they were taken."""
 
     pictures: Generator[VideoFrame]
-    """Generator of the frames; closing it releases the file or camera."""
+    """Generator of the frames; closing it releases the file or camera. It ends with a `VideoError` where a
+    video is damaged or cut off or changes its size."""
 
     count: int | None
     """Number of frames; None where it is not known in advance."""
@@ -57,7 +64,8 @@ class FrameSource:
 def open_frames(source: str | Path, orientation: Orientation = "upright") -> FrameSource:
     """Open a video file, a folder of images, or a camera by its index.
 
-    Images are read upright or as they are stored, as `orientation` says; videos are always upright.
+    Images are read upright or as they are stored, as `orientation` says; videos are always read as a
+    player shows them: in square pixels, rotated and mirrored as the file says.
 
     Raises:
         InputError: The file, folder or camera does not exist or contains no image.
@@ -101,49 +109,33 @@ def _open_camera(index: int) -> FrameSource:
 
 def _captured(capture) -> Generator[VideoFrame]:
     try:
-        index = 0
-        while True:
+        start = None
+        for index in count():
             ok, bgr = capture.read()
             if not ok:
                 return
-            yield VideoFrame(
-                name=_name(index), image=np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-            )
-            index += 1
+            now = perf_counter()
+            start = now if start is None else start
+            image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+            yield VideoFrame(name=_name(index), image=image, seconds=now - start)
     finally:
         capture.release()
 
 
 def _open_video(path: Path) -> FrameSource:
-    av = _av()
-    try:
-        container = av.open(str(path))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such video") from error
-    except (av.error.FFmpegError, OSError) as error:
-        raise InputError(f"{path}: not a readable video") from error
-    if not container.streams.video:
-        container.close()
-        raise InputError(f"{path}: contains no images")
-    stream = container.streams.video[0]
+    container, stream = open_film(path)
     return FrameSource(
-        pictures=_decoded(path, container),
+        pictures=_decoded(film_pictures(path, container, stream)),
         count=stream.frames or None,
         frames_per_second=float(stream.average_rate or _DEFAULT_RATE),
         is_live=False,
     )
 
 
-def _decoded(path: Path, container) -> Generator[VideoFrame]:
-    with container:
-        stream, index = container.streams.video[0], 0
-        stream.thread_type = "AUTO"
-        try:
-            for index, frame in enumerate(container.decode(stream)):
-                image = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
-                yield VideoFrame(name=_name(index), image=np.ascontiguousarray(image))
-        except _av().error.FFmpegError as error:
-            raise InputError(f"{path}: cannot be decoded beyond frame {index}") from error
+def _decoded(pictures: Generator[tuple[Image, float | None]]) -> Generator[VideoFrame]:
+    with closing(pictures):
+        for index, (image, seconds) in enumerate(pictures):
+            yield VideoFrame(name=_name(index), image=image, seconds=seconds)
 
 
 def _name(index: int) -> str:
@@ -159,7 +151,7 @@ def check_format(path: str | Path) -> None:
     """
     if Path(path).suffix not in VIDEO_FORMATS:
         raise OutputError(f"{path}: videos are written as {', '.join(VIDEO_FORMATS)}")
-    _av()
+    pyav()
 
 
 @contextmanager
@@ -176,7 +168,7 @@ def write_video(
     path = Path(path)
     with (
         replacing(path, overwrite=overwrite) as partial,
-        _av().open(str(partial), "w", format=VIDEO_FORMATS[path.suffix]) as container,
+        pyav().open(str(partial), "w", format=VIDEO_FORMATS[path.suffix]) as container,
     ):
         stream = None
 
@@ -187,17 +179,9 @@ def write_video(
                 stream = container.add_stream("libx264", Fraction(frames_per_second).limit_denominator(1001))
                 stream.height, stream.width = even.shape[:2]
                 stream.pix_fmt, stream.options = "yuv420p", _QUALITY
-            frame = _av().VideoFrame.from_ndarray(even, format="rgb24")
+            frame = pyav().VideoFrame.from_ndarray(even, format="rgb24")
             container.mux(stream.encode(frame))
 
         yield write
         if stream is not None:
             container.mux(stream.encode(None))
-
-
-def _av() -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        raise InputError("videos need PyAV: pip install 'slimsfm[video]'") from error
-    return av
