@@ -7,6 +7,7 @@ import pytest
 from PIL.TiffImagePlugin import IFDRational
 
 from exif_photos import STORED, save_photo
+from slimsfm.devices import Device
 from slimsfm.exif import camera_from_exif, ignored_values, read_exif, read_orientation
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 60, 3)).astype(np.uint8)
@@ -45,7 +46,7 @@ def test_without_exif_the_focal_length_is_guessed_and_marked_as_such(tmp_path, s
     camera = exif.camera("upright")
     assert not camera.has_prior_focal_length
     assert camera.focal_length == pytest.approx(1.2 * 60)
-    assert (exif.ignored, exif.device) == ("", ("", "", 0))
+    assert (exif.ignored, exif.device) == ("", Device())
 
 
 @pytest.mark.parametrize(

@@ -103,8 +103,8 @@ def query_camera(
 
     1. The given camera, scaled to the image.
     2. The camera of the map that fits: by the size, also scaled or held sideways, and by make, model, focal
-       length and digital zoom in EXIF, where they are known. Of several, the one of the same model and size is
-       taken; if these differ, none.
+       length and digital zoom in EXIF, where they are known. Of several, the one of the same model and size
+       is taken; if these differ, none.
     3. EXIF: the map's camera with another zoom, or the focal length in EXIF, unless a crop or a digital zoom
        makes it doubtful.
     4. A guess by `guess_camera`, of which only the size is known.

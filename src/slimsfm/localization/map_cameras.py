@@ -34,8 +34,8 @@ def camera_by_exif(map: Map, exif: Exif) -> pycolmap.Camera | None:
     """The one camera of a map that took a photo, in its pixels.
 
     Nothing in EXIF may contradict it: make, model, focal lengths and digital zoom are those of the photos
-    that the camera was made with, where both are known. Where they are not, the focal length in EXIF is within
-    10 % of the camera's.
+    that the camera was made with, where both are known. Where no focal lengths can be compared, that in EXIF
+    is within 10 % of the camera's.
 
     Returns:
         The camera; None if there is none, if several differ, or if the photo is a crop.

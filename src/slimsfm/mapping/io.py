@@ -225,6 +225,16 @@ def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
     return np.array(values, np.float64).reshape(shape)
 
 
+def _device(data: dict) -> Device:
+    return Device(
+        make=str(data["make"]),
+        model=str(data["model"]),
+        focal_mm=float(data["focal_mm"]),
+        focal_35mm=float(data["focal_35mm"]),
+        digital_zoom=float(data["digital_zoom"]),
+    )
+
+
 def _orientation(value: object) -> Orientation:
     for known in get_args(Orientation):
         if value == known:
@@ -255,7 +265,7 @@ def _read_info(path: Path) -> MapInfo:
             exif_orientations={
                 str(name): int(tag) for name, tag in data.get("exif_orientations", {}).items()
             },
-            devices={int(key): Device(**device) for key, device in data.get("devices", {}).items()},
+            devices={int(key): _device(device) for key, device in data.get("devices", {}).items()},
         )
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error
