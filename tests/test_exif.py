@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL.TiffImagePlugin import IFDRational
 
@@ -83,6 +84,13 @@ def test_the_focal_lengths_of_lenses_are_used(tmp_path, focal_35mm):
     exif = read_exif(save_photo(tmp_path / "a.jpg", PICTURE, FocalLengthIn35mmFilm=focal_35mm))
     assert exif.focal_px == pytest.approx(focal_35mm / np.hypot(36, 24) * np.hypot(60, 40), rel=1e-3)
     assert not exif.ignored
+
+
+def test_the_focal_length_for_film_counts_in_formats_that_colmap_does_not_read(tmp_path):
+    path = save_photo(tmp_path / "a.avif", PICTURE, FocalLengthIn35mmFilm=28)
+    with pytest.raises((RuntimeError, ValueError)):
+        pycolmap.infer_camera_from_image(path)
+    assert read_exif(path).focal_px == pytest.approx(28 / np.hypot(36, 24) * np.hypot(60, 40))
 
 
 @pytest.mark.parametrize("resolution", [200, 500, 2000])

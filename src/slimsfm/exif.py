@@ -54,7 +54,7 @@ class Exif:
     @property
     def problem(self) -> str:
         """Why the focal length is unknown, where it is."""
-        if self.focal_px is not None and self.doubt:
+        if self.doubt:
             return self.doubt
         return f"EXIF has {self.ignored}, which is impossible" if self.ignored else "no EXIF data"
 
@@ -73,7 +73,7 @@ class Exif:
             (width, height), (before, above) = self.stored_size, self.original_size or (0, 0)
             return f"its {width}x{height} pixels were cut out of {before}x{above}"
         if self.device.focal_35mm and zoom > _SLIGHT_ZOOM:
-            return f"it may or may not include the digital zoom ({zoom:g}x)"
+            return f"whether it includes the digital zoom ({zoom:g}x) is unknown"
         return ""
 
     @property

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
+from PIL.PngImagePlugin import PngInfo
 from PIL.TiffImagePlugin import IFDRational
 
 from exif_photos import save_photo
 from scenes import camera
 from slimsfm.devices import Device
-from slimsfm.localization.cameras import camera_in_memory, guess_camera, query_camera
+from slimsfm.localization.cameras import UnknownIntrinsicsError, camera_in_memory, guess_camera, query_camera
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.orientation import turned_camera
@@ -33,9 +34,7 @@ def save(path: Path, size: tuple[int, int] = (640, 480), orientation: int = 1, *
     return save_photo(path, np.zeros((size[1], size[0], 3), np.uint8), orientation, **tags)
 
 
-def with_cameras(
-    map_: Map, cameras: list[pycolmap.Camera], devices: dict[int, Device] | None = None
-) -> Map:
+def with_cameras(map_: Map, cameras: list[pycolmap.Camera], devices: dict[int, Device] | None = None) -> Map:
     """The map with one camera per image, in turn, with the ids 1, 2, ..."""
     model = pycolmap.Reconstruction()
     for image_id, image in enumerate(map_.images.values(), start=1):
@@ -155,3 +154,132 @@ def test_the_order(case: Case, has_device: bool, exact: Map, known: Map, tmp_pat
     if turned == (640, 480):
         assert query_camera(map_, path, other(900)).source == "given"
         assert query_camera(map_, path, other(900)).camera.mean_focal_length() == 900
+
+
+def test_a_picture_held_sideways_has_the_turned_camera(known: Map, tmp_path: Path) -> None:
+    for orientation, turns in ((6, 1), (8, 3)):
+        path = save(tmp_path / "a.jpg", (480, 640), orientation, **PHONE)
+        chosen = query_camera(known, path, None).camera
+        assert np.allclose(chosen.params, turned_camera(camera(), turns).params)
+
+
+def test_a_digital_zoom_enlarges_the_center(known: Map, tmp_path: Path) -> None:
+    """What the map's camera sees at (x, y) from the center, the zoomed one sees at twice that."""
+    rays = np.random.default_rng(0).uniform(-0.2, 0.2, (50, 2))
+    rays = np.column_stack([rays, np.ones(50)])
+    zoomed = query_camera(known, save(tmp_path / "a.jpg", **PHONE, DigitalZoomRatio=IFDRational(2, 1)), None)
+    center = np.array([320, 240])
+    expected = center + 2 * (camera().img_from_cam(rays) - center)
+    assert np.allclose(zoomed.camera.img_from_cam(rays), expected)
+
+
+def test_a_digital_zoom_counts_where_the_focal_length_cannot_include_it(exact: Map, tmp_path: Path) -> None:
+    lens = {"Make": "Apple", "Model": "iPhone 6", "FocalLength": IFDRational(42, 10)}  # in COLMAP's list
+    map_ = with_cameras(exact, [other(2000)])
+    plain = query_camera(map_, save(tmp_path / "a.jpg", **lens), None)
+    zoomed = query_camera(map_, save(tmp_path / "b.jpg", **lens, DigitalZoomRatio=IFDRational(3, 1)), None)
+    assert (plain.source, zoomed.source) == ("exif", "exif")
+    assert zoomed.camera.focal_length == pytest.approx(3 * plain.camera.focal_length)
+
+
+@pytest.mark.parametrize("written", ['crs:HasCrop="True"', "<crs:HasCrop>True</crs:HasCrop>"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_a_crop_by_an_editor_is_unknown(written: str, suffix: str, known: Map, tmp_path: Path) -> None:
+    path = save(tmp_path / f"a.{suffix}", **PHONE)
+    with Image.open(path) as file:
+        exif, options = file.getexif(), {}
+        exif.get_ifd(ExifTags.IFD.Exif)  # or it would not be saved
+        if suffix == "tif":
+            exif[ExifTags.Base.XMLPacket] = written.encode()
+        elif suffix != "png":
+            options = {"xmp": written.encode()}
+        else:
+            info = PngInfo()
+            info.add_itxt("XML:com.adobe.xmp", written)
+            options = {"pnginfo": info}
+        file.save(path, exif=exif, **options)
+    chosen = query_camera(known, path, None)
+    assert chosen.source == "unknown"
+    (note,) = chosen.notes
+    assert note.startswith(f"{path}: ")
+    assert "cropped" in note
+    with pytest.raises(UnknownIntrinsicsError, match=r"a\..*cropped"):
+        query_camera(known, path, None, "known")
+
+
+@pytest.mark.parametrize(
+    ("tags", "said"),
+    [
+        ({"FocalLengthIn35mmFilm": 65535}, "FocalLengthIn35mmFilm 65535, which is impossible"),
+        ({"FocalLengthIn35mmFilm": 0}, "FocalLengthIn35mmFilm 0, which is impossible"),
+        ({"DigitalZoomRatio": IFDRational(1000, 1)}, "DigitalZoomRatio 1000"),
+        ({"DigitalZoomRatio": IFDRational(1, 10)}, "DigitalZoomRatio 0.1"),
+        ({"DigitalZoomRatio": IFDRational(0, 0)}, "DigitalZoomRatio nan"),
+        (
+            {"FocalLengthIn35mmFilm": 28, "DigitalZoomRatio": IFDRational(2, 1)},
+            "includes the digital zoom (2x) is unknown",
+        ),
+        (
+            {"FocalLengthIn35mmFilm": 28, "ExifImageWidth": 4000, "ExifImageHeight": 2000},
+            "its 640x480 pixels were cut out of 4000x2000",
+        ),
+    ],
+    ids=repr,
+)
+def test_what_is_ignored_is_said_with_the_photo(tags: dict, said: str, exact: Map, tmp_path: Path) -> None:
+    path = save(tmp_path / "odd.jpg", **tags)
+    (note,) = query_camera(exact, path, None).notes
+    assert note.startswith(f"{path}: ")
+    assert said in note
+    assert query_camera(exact, path, camera()).notes == ()  # it does not matter then
+
+
+def test_equal_cameras_are_one_whatever_their_ids(exact: Map, tmp_path: Path) -> None:
+    """Exports of NeRFs have a camera for each image."""
+    nerf = with_cameras(exact, [camera()])
+    assert len(nerf.model.cameras) == 6
+    assert len(nerf.cameras) == 1
+    chosen = query_camera(nerf, save(tmp_path / "a.png"), None, "known")
+    assert chosen.source == "map"
+    assert np.array_equal(chosen.camera.params, camera().params)
+    assert np.array_equal(nerf.shared_camera.params, camera().params)
+    write_map(nerf, tmp_path / "map")
+    assert len(read_map(tmp_path / "map").cameras) == 1
+
+
+def test_of_several_cameras_the_one_that_fits_is_taken(exact: Map, tmp_path: Path) -> None:
+    wide, long = other(400), other(800)
+    upright, small = other(600, (480, 640)), other(300, (320, 240))
+    of_long = Device(make="Acme", model="P1", focal_mm=8.4)
+    map_ = with_cameras(exact, [wide, long, upright], {1: DEVICE, 4: DEVICE, 2: of_long, 5: of_long})
+
+    def source_and_focal(path: Path, within: Map = map_) -> tuple[str, float]:
+        chosen = query_camera(within, path, None)
+        return chosen.source, round(chosen.camera.mean_focal_length())
+
+    assert source_and_focal(save(tmp_path / "a.jpg", **PHONE)) == ("map", 400)
+    assert source_and_focal(save(tmp_path / "a.jpg", **{**LENS, "FocalLength": IFDRational(84, 10)})) == (
+        "map",
+        800,
+    )
+    assert source_and_focal(save(tmp_path / "a.jpg")) == ("unknown", GUESS)  # both fit, and differ
+    assert source_and_focal(save(tmp_path / "a.jpg", (480, 640))) == ("map", 600)  # one has this size
+    sizes = with_cameras(exact, [wide, small])
+    assert source_and_focal(save(tmp_path / "a.jpg"), sizes) == ("map", 400)
+    assert source_and_focal(save(tmp_path / "a.jpg", (320, 240)), sizes) == ("map", 300)
+    assert source_and_focal(save(tmp_path / "a.jpg", (1280, 960)), sizes) == ("unknown", 2 * GUESS)
+    closest = save(tmp_path / "a.jpg", FocalLengthIn35mmFilm=35)
+    assert source_and_focal(closest, with_cameras(exact, [wide, other(650)])) == ("map", 650)
+
+
+def test_an_image_in_memory_has_the_camera_of_the_map_of_its_size(exact: Map, two_cameras: Map) -> None:
+    given = camera_in_memory(exact, 640, 480, other(900))
+    assert (given.source, given.camera.focal_length_x) == ("given", 900)
+    of_map = camera_in_memory(exact, 320, 240)
+    assert (of_map.source, of_map.camera.focal_length_x) == ("map", 250)
+    for map_, size in ((exact, (480, 640)), (two_cameras, (640, 480))):
+        unknown = camera_in_memory(map_, *size)
+        assert unknown.source == "unknown"
+        assert np.array_equal(unknown.camera.params, guess_camera(*size).params)
+    with pytest.raises(ValueError, match="size 320x240, got 640x480"):
+        camera_in_memory(exact, 320, 240, camera())

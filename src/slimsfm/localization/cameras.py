@@ -138,8 +138,8 @@ def query_camera(
             f"{path}: its focal length is unknown ({exif.problem}, and not taken with {_cameras_of(map)}); "
             "give `camera=FILE`, or estimate it with `focal='unknown'`"
         )
-    if exif.focal_px is not None:
-        notes = (*notes, f"{path}: the focal length in EXIF is not used: {exif.doubt}")
+    if exif.doubt:
+        notes = (*notes, f"{path}: no focal length is taken from EXIF: {exif.doubt}")
     return QueryCamera(camera=guess_camera(*size), source="unknown", notes=notes)
 
 

@@ -48,8 +48,9 @@ class LocalizationOptions:
     """How the pose is estimated."""
 
     focal: FocalLength = "known"
-    """Whether the focal length of the queries is known, known to 30 % (approximate), or unknown. If it is not
-    known, it is estimated together with the pose."""
+    """How well the focal length of the queries is known. auto: known if it is given or the map's, to 30 % if
+    it is from EXIF, else unknown. known refuses images that nothing is known of; approximate and unknown
+    believe whatever is known to 30 % or not at all. If it is not known, it is estimated with the pose."""
 
     min_confidence: float = 0.5
     """Poses of lower confidence are discarded: the query counts as not localized."""
