@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL.TiffImagePlugin import IFDRational
 
 from exif_photos import STORED, save_photo
+from slimsfm.devices import Device
 from slimsfm.exif import camera_from_exif, ignored_values, read_exif, read_orientation
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 60, 3)).astype(np.uint8)
@@ -45,7 +47,7 @@ def test_without_exif_the_focal_length_is_guessed_and_marked_as_such(tmp_path, s
     camera = exif.camera("upright")
     assert not camera.has_prior_focal_length
     assert camera.focal_length == pytest.approx(1.2 * 60)
-    assert (exif.ignored, exif.device) == ("", ("", "", 0))
+    assert (exif.ignored, exif.device) == ("", Device())
 
 
 @pytest.mark.parametrize(
@@ -82,6 +84,13 @@ def test_the_focal_lengths_of_lenses_are_used(tmp_path, focal_35mm):
     exif = read_exif(save_photo(tmp_path / "a.jpg", PICTURE, FocalLengthIn35mmFilm=focal_35mm))
     assert exif.focal_px == pytest.approx(focal_35mm / np.hypot(36, 24) * np.hypot(60, 40), rel=1e-3)
     assert not exif.ignored
+
+
+def test_the_focal_length_for_film_counts_in_formats_that_colmap_does_not_read(tmp_path):
+    path = save_photo(tmp_path / "a.avif", PICTURE, FocalLengthIn35mmFilm=28)
+    with pytest.raises((RuntimeError, ValueError)):
+        pycolmap.infer_camera_from_image(path)
+    assert read_exif(path).focal_px == pytest.approx(28 / np.hypot(36, 24) * np.hypot(60, 40))
 
 
 @pytest.mark.parametrize("resolution", [200, 500, 2000])

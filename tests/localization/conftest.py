@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pycolmap
 import pytest
 
@@ -14,11 +15,12 @@ def boulder(tmp_path_factory) -> Rendered:
 
 @pytest.fixture(scope="session")
 def two_cameras(exact) -> Map:
-    """The exact scene with a second camera for the first image."""
+    """The exact scene with another camera of the same size for the first image."""
     model = pycolmap.Reconstruction()
     for camera_id in (1, 2):
         camera = pycolmap.Camera(exact.shared_camera.todict())
         camera.camera_id = camera_id
+        camera.params = camera.params * np.array([camera_id, camera_id, 1, 1, 1, 1, 1, 1])
         model.add_camera_with_trivial_rig(camera)
     for image_id, image in enumerate(exact.images.values(), start=1):
         keypoints = exact.features[image.name].keypoints.astype(float)

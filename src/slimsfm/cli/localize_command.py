@@ -48,8 +48,8 @@ def localize(
         also: Maps of further objects to find in the same images. Poses are then written as .json or .csv.
         localization: How to localize.
         networks: Where learned methods run.
-        camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map or from
-            EXIF are used.
+        camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map where
+            size and EXIF fit, else from EXIF; else the focal length is estimated.
         gravity: Direction of gravity as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame
             of the map and in the camera frames of the images.
         workers: Number of images to localize at a time, by default the number of cores.

@@ -10,7 +10,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.errors import ImageError, InputError
-from slimsfm.exif import read_exif
+from slimsfm.exif import Exif, read_exif
+from slimsfm.localization.map_cameras import camera_by_exif, camera_of_size, scaled_camera, zoomed_camera
 from slimsfm.mapping.map import Map
 from slimsfm.pose.types import Gravity
 
@@ -23,7 +24,6 @@ CameraSource = Literal["given", "map", "exif", "unknown"]
 The first two are known, EXIF is approximate."""
 
 _GUESS = 1.2  # focal length over the longer side, the default of COLMAP
-_SAME_FOCAL = 0.1  # relative difference below which EXIF means the map's camera, whose calibration is better
 
 
 class UnknownIntrinsicsError(ImageError):
@@ -77,15 +77,6 @@ def _is_usable(camera: pycolmap.Camera) -> bool:
     return bool(np.all(np.isfinite(camera.params)) and len(focal_lengths) and np.all(focal_lengths > 0))
 
 
-def scaled_camera(camera: pycolmap.Camera, width: int, height: int) -> pycolmap.Camera | None:
-    """The camera of an image resized to this size; None if the aspect ratio differs."""
-    if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
-        return None
-    scaled = pycolmap.Camera(camera.todict())
-    scaled.rescale(width, height)
-    return scaled
-
-
 def guess_camera(width: int, height: int) -> pycolmap.Camera:
     """The camera of an image of which only the size is known, such as one in memory.
 
@@ -108,7 +99,21 @@ def query_camera(
 ) -> QueryCamera:
     """Choose the intrinsics of a query image, read upright or as stored as the map says.
 
-    In this order: the given camera; the map's; that of EXIF; a guess by `guess_camera`.
+    In this order:
+
+    1. The given camera, scaled to the image.
+    2. The camera of the map that fits: by the size, also scaled or held sideways, and by make, model, focal
+       length and digital zoom in EXIF, where they are known. Of several, the one of the same model and size
+       is taken; if these differ, none.
+    3. EXIF: the map's camera with another zoom, or the focal length in EXIF, unless a crop or a digital zoom
+       makes it doubtful.
+    4. A guess by `guess_camera`, of which only the size is known.
+
+    Args:
+        map: The map.
+        path: The image.
+        given: Intrinsics to use.
+        focal: "known" refuses a guess; otherwise the choice is the same for all values.
 
     Raises:
         UnknownIntrinsicsError: The given camera has another aspect ratio, or the focal length must be known
@@ -119,25 +124,23 @@ def query_camera(
     path = Path(path)
     if focal not in get_args(FocalLength):
         raise ValueError(f"focal must be one of {', '.join(get_args(FocalLength))}, got {focal!r}")
-    found = read_exif(path)
-    exif = found.camera(map.info.orientation)
-    candidate = given or map.shared_camera
-    scaled = candidate and scaled_camera(candidate, exif.width, exif.height)
-    if given and scaled is None:
-        raise UnknownIntrinsicsError(
-            f"{path}: has {exif.width}x{exif.height} pixels, but the given camera "
-            f"{given.width}x{given.height}; give the camera of this image"
-        )
-    if scaled and (given or not exif.has_prior_focal_length or _same_focal(exif, scaled)):
-        return QueryCamera(camera=scaled, source="given" if given else "map")
-    if exif.has_prior_focal_length:
-        return QueryCamera(camera=exif, source="exif")
+    exif = read_exif(path)
+    size = exif.size(map.info.orientation)
+    if given:
+        return QueryCamera(camera=_given(given, path, size), source="given")
+    notes = _notes(path, exif)
+    if camera := camera_by_exif(map, exif):
+        return QueryCamera(camera=camera, source="map", notes=notes)
+    if camera := zoomed_camera(map, exif) or _by_exif(exif, size):
+        return QueryCamera(camera=camera, source="exif", notes=notes)
     if focal == "known":
         raise UnknownIntrinsicsError(
-            f"{path}: its focal length is unknown ({found.problem}, and not taken with the map's camera); "
+            f"{path}: its focal length is unknown ({exif.problem}, and not taken with {_cameras_of(map)}); "
             "give `camera=FILE`, or estimate it with `focal='unknown'`"
         )
-    return QueryCamera(camera=guess_camera(exif.width, exif.height), source="unknown")
+    if exif.doubt:
+        notes = (*notes, f"{path}: no focal length is taken from EXIF: {exif.doubt}")
+    return QueryCamera(camera=guess_camera(*size), source="unknown", notes=notes)
 
 
 def camera_in_memory(map: Map, width: int, height: int, given: pycolmap.Camera | None = None) -> QueryCamera:
@@ -150,26 +153,49 @@ def camera_in_memory(map: Map, width: int, height: int, given: pycolmap.Camera |
         given: Intrinsics to use; they must be of this size.
 
     Returns:
-        The given camera; else the one camera of the map that has this aspect ratio; else a guess.
+        The given camera; else the one camera of the map that has this aspect ratio, of several the one of
+        this size; else a guess by `guess_camera`.
 
     Raises:
         ValueError: The given camera has another size, or the size is not positive.
     """
-    if given is not None and (given.width, given.height) != (width, height):
-        raise ValueError(
-            f"camera must have the image's size {width}x{height}, got {given.width}x{given.height}"
-        )
     if given is not None:
+        if (given.width, given.height) != (width, height):
+            raise ValueError(
+                f"camera must have the image's size {width}x{height}, got {given.width}x{given.height}"
+            )
         return QueryCamera(camera=given, source="given")
-    shared = map.shared_camera
-    scaled = shared and scaled_camera(shared, width, height)
-    if scaled:
-        return QueryCamera(camera=scaled, source="map")
+    if camera := camera_of_size(map, width, height):
+        return QueryCamera(camera=camera, source="map")
     return QueryCamera(camera=guess_camera(width, height), source="unknown")
 
 
-def _same_focal(a: pycolmap.Camera, b: pycolmap.Camera) -> bool:
-    return abs(a.mean_focal_length() / b.mean_focal_length() - 1) < _SAME_FOCAL
+def _given(given: pycolmap.Camera, path: Path, size: tuple[int, int]) -> pycolmap.Camera:
+    scaled = scaled_camera(given, *size)
+    if scaled is None:
+        raise UnknownIntrinsicsError(
+            f"{path}: has {size[0]}x{size[1]} pixels, but the given camera {given.width}x{given.height}; "
+            "give the camera of this image"
+        )
+    return scaled
+
+
+def _by_exif(exif: Exif, size: tuple[int, int]) -> pycolmap.Camera | None:
+    focal_px = exif.approximate_focal_px
+    if focal_px is None:
+        return None
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *size)
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def _notes(path: Path, exif: Exif) -> tuple[str, ...]:
+    return (f"{path}: EXIF has {exif.ignored}, which is impossible and ignored",) if exif.ignored else ()
+
+
+def _cameras_of(map: Map) -> str:
+    count = len(map.cameras)
+    return "the map's camera" if count == 1 else f"one of the map's {count} cameras alone"
 
 
 def read_gravity(path: str | Path) -> dict[str, Gravity]:

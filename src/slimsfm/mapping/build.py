@@ -6,10 +6,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from slimsfm.devices import Device
 from slimsfm.errors import InputError, ReconstructionError
-from slimsfm.exif import Exif, ignored_values, read_exif, read_orientation
+from slimsfm.exif import Exif, ignored_values, read_device, read_exif, read_orientation
 from slimsfm.features import Extractor, load_extractor
 from slimsfm.geometry import Box
+from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import guess_cameras
 from slimsfm.mapping.keypoint_model import build_from_keypoints
@@ -129,6 +131,7 @@ def _map(
         notes=notes,
         orientation=options.orientation,
         exif_orientations=_exif_orientations(work, exifs) if options.orientation == "upright" else {},
+        devices=devices_by_camera(parts.model, _devices(work, exifs)),
     )
     return Map(
         model=parts.model,
@@ -146,6 +149,10 @@ def _exif_orientations(work: BuildWork, exifs: Mapping[str, Exif]) -> dict[str, 
         for name in work.names
     }
     return {name: tag for name, tag in tags.items() if tag != 1}
+
+
+def _devices(work: BuildWork, exifs: Mapping[str, Exif]) -> dict[str, Device]:
+    return {name: exifs[name].device if exifs else read_device(work.images / name) for name in work.names}
 
 
 def _origins(quality: ModelQuality, work: BuildWork) -> dict[str, str]:

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from slimsfm.devices import Device
 from slimsfm.errors import ModelError
-from slimsfm.exif import read_orientation
+from slimsfm.exif import read_device, read_orientation
 from slimsfm.features import Features
 from slimsfm.features.store import stored_name
 from slimsfm.mapping.agreement import Masks, counted, place_features
+from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.map import Map, MapInfo
 from slimsfm.mapping.model import camera_of, estimate_box, positions, read_box, read_model
@@ -122,6 +124,7 @@ def import_colmap(
         notes=(*notes, *source.notes, *more, *left_out),
         orientation=options.orientation,
         exif_orientations=_tags(model, options),
+        devices=_devices(model, options),
     )
     return with_global_descriptors(Map(model=model, features=features, matches=matches, info=info))
 
@@ -136,6 +139,13 @@ def _tags(model: pycolmap.Reconstruction, options: ImportOptions) -> dict[str, i
         return {}
     tags = {image.name: read_orientation(options.images / image.name) for image in _posed_images(model)}
     return {name: tag for name, tag in tags.items() if tag != 1}
+
+
+def _devices(model: pycolmap.Reconstruction, options: ImportOptions) -> dict[int, Device]:
+    if options.images is None:
+        return {}
+    names = [image.name for image in _posed_images(model)]
+    return devices_by_camera(model, {name: read_device(options.images / name) for name in names})
 
 
 def _find_source(

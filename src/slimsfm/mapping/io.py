@@ -7,7 +7,7 @@ MAP/
   photos.h5     shrunk photos; in maps built without a detector
   global.npz    global descriptors of the images; may be missing
   points.npz    points for direct matching; in reduced maps, often instead of features.h5 and matches.h5
-  map.json      format version, extractor and its options, box, unit, origin, notes, orientation
+  map.json      format version, extractor and its options, box, unit, origin, notes, orientation, devices
 """
 
 import json
@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from slimsfm.arrays import Image
+from slimsfm.devices import Device
 from slimsfm.errors import InputError, MapError
 from slimsfm.features.hdf5 import creating, opened, read_array
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
@@ -199,6 +200,8 @@ def bytes_by_part(path: Path) -> dict[str, int]:
 
 def _info_to_json(map: Map) -> dict:
     info = map.info
+    used = {image.camera_id for image in map.images.values()}
+    devices = {str(key): asdict(device) for key, device in sorted(info.devices.items()) if key in used}
     tags = {name: info.exif_orientations[name] for name in map.images if name in info.exif_orientations}
     return {
         "format_version": FORMAT_VERSION,
@@ -213,12 +216,23 @@ def _info_to_json(map: Map) -> dict:
         "notes": list(info.notes),
         "orientation": info.orientation,
         **({"exif_orientations": tags} if tags else {}),
+        **({"devices": devices} if devices else {}),
         "quality": None if info.quality is None else asdict(info.quality),
     }
 
 
 def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
     return np.array(values, np.float64).reshape(shape)
+
+
+def _device(data: dict) -> Device:
+    return Device(
+        make=str(data["make"]),
+        model=str(data["model"]),
+        focal_mm=float(data["focal_mm"]),
+        focal_35mm=float(data["focal_35mm"]),
+        digital_zoom=float(data["digital_zoom"]),
+    )
 
 
 def _orientation(value: object) -> Orientation:
@@ -251,6 +265,7 @@ def _read_info(path: Path) -> MapInfo:
             exif_orientations={
                 str(name): int(tag) for name, tag in data.get("exif_orientations", {}).items()
             },
+            devices={int(key): _device(device) for key, device in data.get("devices", {}).items()},
         )
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error

@@ -12,10 +12,12 @@ from jaxtyping import Float32, UInt8
 from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, Image, IndexPairs, Mask, Points3D
+from slimsfm.devices import Device
 from slimsfm.errors import MapError
 from slimsfm.features import Features, NearestOptions, shrink_factor
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
+from slimsfm.mapping.cameras import MapCamera, distinct_cameras
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation
 
@@ -56,6 +58,10 @@ class MapInfo:
     exif_orientations: Mapping[str, int] = field(default_factory=dict)
     """EXIF orientation of the images of an upright map, by name, where it is not 1. Empty in maps of version
     0.1, which did not record it."""
+
+    devices: Mapping[int, Device] = field(default_factory=dict)
+    """What EXIF says of the photos that a camera was made with, by its id, where they agree. Empty in older
+    maps and in maps made without the photos."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -188,6 +194,13 @@ class Map:
         found = [self.model.image(image_id) for image_id in self.model.reg_image_ids()]
         return {image.name: image for image in sorted(found, key=lambda image: image.name)}
 
+    @cached_property
+    def cameras(self) -> tuple[MapCamera, ...]:
+        """The cameras of the reference images that differ; equal ones under several ids count once."""
+        ids = {image.camera_id for image in self.images.values()}
+        cameras = {camera_id: self.model.camera(camera_id) for camera_id in ids}
+        return distinct_cameras(self.images.values(), cameras, self.info.devices, self.info.exif_orientations)
+
     def camera(self, name: str) -> pycolmap.Camera:
         """The camera of a reference image."""
         return self.model.camera(self.images[name].camera_id)
@@ -242,9 +255,8 @@ class Map:
 
     @property
     def shared_camera(self) -> pycolmap.Camera | None:
-        """The camera of all reference images, or None if they have several."""
-        ids = {image.camera_id for image in self.images.values()}
-        return self.model.camera(ids.pop()) if len(ids) == 1 else None
+        """The camera of all reference images, or None if they have several that differ."""
+        return self.cameras[0].camera if len(self.cameras) == 1 else None
 
 
 def observed(map: Map) -> csr_array:

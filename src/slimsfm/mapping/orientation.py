@@ -41,6 +41,21 @@ _RAD_TAN = {
 }
 
 
+def turns_between(orientation: int, other: int) -> int | None:
+    """Turns from an upright picture to another taken with the camera held differently.
+
+    Args:
+        orientation: EXIF orientation of the picture.
+        other: That of the other one.
+
+    Returns:
+        From 0 to 3, so that the camera is the turned camera; None if one of the pictures is mirrored.
+    """
+    if orientation not in _TURNS_TO_STORED or other not in _TURNS_TO_STORED:
+        return None
+    return (_TURNS_TO_STORED[orientation] - _TURNS_TO_STORED[other]) % 4
+
+
 def turned_camera(camera: pycolmap.Camera, turns: int) -> pycolmap.Camera:
     """The camera of a picture that is turned.
 
