@@ -87,7 +87,7 @@ def test_the_focal_lengths_of_lenses_are_used(tmp_path, focal_35mm):
 
 
 def test_the_focal_length_for_film_counts_in_formats_that_colmap_does_not_read(tmp_path):
-    path = save_photo(tmp_path / "a.avif", PICTURE, FocalLengthIn35mmFilm=28)
+    path = save_photo(tmp_path / "a.avif", PICTURE, Make="Acme", FocalLengthIn35mmFilm=28)
     with pytest.raises((RuntimeError, ValueError)):
         pycolmap.infer_camera_from_image(path)
     assert read_exif(path).focal_px == pytest.approx(28 / np.hypot(36, 24) * np.hypot(60, 40))
