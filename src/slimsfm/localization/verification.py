@@ -20,7 +20,7 @@ This holds on right maps. Next to images that the map's own matches contradict, 
 there, 60 % of the confidence remains.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -31,6 +31,7 @@ from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+from slimsfm.pose.camera_fit import misfit
 
 EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
 """Weights of `Evidence.terms`, learned by `benchmarks/confidence.py`."""
@@ -42,6 +43,7 @@ UNAMBIGUOUS = 0.75
 """Share of distinct inliers from which a pose is unambiguous."""
 
 _DOUBTED = 0.6  # of the confidence, next to contradicted images
+_CELLS = 16  # squares along the longer side of the image
 _NEAREST = 3  # images that are next to a pose
 _CHECKED = 100  # visible points to look for
 _STRONGEST = 2048  # keypoints to look among
@@ -70,6 +72,15 @@ class Evidence:
 
     found: float
     """Share of the points that should be visible that are found where they project and nowhere else."""
+
+    uncalibrated_error: float = 0.0
+    """Predicted relative corner error if nothing but the matches said what the intrinsics are."""
+
+    misfit: float = 0.0
+    """How much the matches contradict the intrinsics: 1 is where more of them would have been estimated."""
+
+    cells: int = 0
+    """Number of squares, a sixteenth of the longer side wide, with keypoints that agree with the pose."""
 
     doubted: bool = False
     """Whether matches contradict the poses of the reference images next to the pose."""
@@ -140,8 +151,17 @@ class Verifier:
             predicted_error=pose.predicted_corner_error(self._box),
             rival=self._rival(matches, matches.pixels(query), others, pose, camera),
             found=self._found(query, points, pose, camera),
+            uncalibrated_error=self._uncalibrated_error(pose),
+            misfit=misfit(pose.check, pose.estimated) if pose.check else 0.0,
+            cells=_cells(query.keypoints if matches.points2D is None else matches.points2D, agreeing, camera),
             doubted=self._doubted(pose),
         )
+
+    def _uncalibrated_error(self, pose: PoseEstimate) -> float:
+        if pose.covariance is None or pose.check is None:
+            return 1.0
+        whole = replace(pose, covariance=pose.covariance + pose.check.growth)
+        return whole.predicted_corner_error(self._box)
 
     def _doubted(self, pose: PoseEstimate) -> bool:
         center = pose.cam_from_world.inverse().translation
@@ -180,6 +200,11 @@ def _doubtful_images(map: Map) -> Mask:
     """Which reference images, in order of name, see what contradicted images see."""
     doubtful = map.info.quality.doubtful if map.info.quality else ()
     return np.array([name in doubtful for name in map.images], bool)
+
+
+def _cells(keypoints: Points2D, agreeing: Ids, camera: pycolmap.Camera) -> int:
+    side_px = max(camera.width, camera.height) / _CELLS
+    return len(np.unique(np.floor(keypoints[agreeing] / side_px) @ (1.0, 1000.0)))
 
 
 def _count(keypoints: Ids) -> int:

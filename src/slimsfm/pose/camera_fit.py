@@ -49,15 +49,17 @@ FOCAL_LENGTH, PRINCIPAL_POINT, ASPECT_RATIO = _PLACES
 """Names of the intrinsics that may be estimated."""
 
 
-def doubtful_intrinsic(check: CameraCheck, free: tuple[str, ...] = ()) -> str | None:
-    """The intrinsic that matches contradict most, apart from those that are free; None if none."""
-    ratios = {
+def misfit(check: CameraCheck, free: tuple[str, ...] = ()) -> float:
+    """How much matches contradict those of the intrinsics that are not free; from 1 on, one is set free."""
+    return max(_misfits(check, free).values(), default=0.0)
+
+
+def _misfits(check: CameraCheck, free: tuple[str, ...]) -> dict[str, float]:
+    return {
         name: check.decreases[name] / _DECREASES[name]
         for name in _PLACES
         if name not in free and check.changes[name] > _CHANGES[name]
     }
-    worst = max(ratios, key=ratios.__getitem__, default=None)
-    return worst if worst is not None and ratios[worst] > 1 else None
 
 
 def check_camera(
@@ -164,8 +166,9 @@ def fit_camera(
     """
     search = _CameraSearch(points2D, points3D_in_world, camera, options, focal)
     best = search.checked(found)
-    while best.check and (doubtful := doubtful_intrinsic(best.check, best.estimated)):
-        better = search.freed(best, doubtful)
+    while best.check and misfit(best.check, best.estimated) > 1:
+        misfits = _misfits(best.check, best.estimated)
+        better = search.freed(best, max(misfits, key=misfits.__getitem__))
         if better is None:
             break
         best = search.checked(better)
