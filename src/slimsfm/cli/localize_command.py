@@ -94,6 +94,9 @@ def _named(*paths: Path) -> dict[str, Path]:
 def _print(by_object: Mapping[str, Mapping[str, Localization]]) -> int:
     """Print the outcome of each image and the mean times; return how many were localized in any map."""
     images = list(next(iter(by_object.values())))
+    every = (one for results in by_object.values() for one in results.values())
+    for note in dict.fromkeys(note for one in every for note in one.camera_notes):
+        console.print(f"note: {note}", style="yellow", markup=False)
     for image in images:
         for key, results in by_object.items():
             name = f"{image}, {key}" if len(by_object) > 1 else image
@@ -113,4 +116,18 @@ def _outcome(one: Localization) -> str:
     if one.pose is None:
         return "not localized"
     inliers = f"{one.pose.num_inliers} inliers of {one.num_matches} matches"
-    return f"{inliers}, confidence {one.pose.confidence:.2f}"
+    return f"{inliers}, confidence {one.pose.confidence:.2f}{_estimated(one)}"
+
+
+_DO_NOT_FIT = {
+    "given": ", because those given do not fit",
+    "map": ", because those of the map's camera do not fit",
+    "queries": ", because those of the other images do not fit",
+}
+
+
+def _estimated(one: Localization) -> str:
+    """Which intrinsics were estimated, and why."""
+    if not one.camera_estimated:
+        return ""
+    return f", {' and '.join(one.camera_estimated)} estimated{_DO_NOT_FIT.get(one.camera_source, '')}"

@@ -1,6 +1,6 @@
 """Localize images against several maps, and all images of a folder on several threads."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from slimsfm.features import Features
 from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import QueryCamera, query_camera
 from slimsfm.localization.localizer import Localization, Localizer
+from slimsfm.localization.shared_cameras import share_cameras
 from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
@@ -147,7 +148,7 @@ def _localize(
 ) -> dict[str, dict[str, Localization]]:
     if workers is not None and workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
-    tasks = _tasks(localizer, images, camera)
+    tasks = _with_shared_cameras(_tasks(localizer, images, camera), localizer, gravity, workers)
     run = map_on_threads(partial(_localize_one, localizer, gravity), tasks, workers or num_cores())
     strategies = {one.options.strategy_for(one.map) for one in localizer.localizers.values()}
     label = f"localize ({', '.join(sorted(strategies))})"
@@ -170,6 +171,29 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
         )
         for name in names
     ]
+
+
+def _with_shared_cameras(
+    tasks: list[_Task], localizer: MultiLocalizer, gravity: Mapping[str, Gravity], workers: int | None
+) -> list[_Task]:
+    """The images, with focal lengths that those of one camera agree on where the user leaves it open."""
+    by_name = {task.name: task for task in tasks}
+    for key, one in localizer.localizers.items():
+        if one.options.focal != "auto":
+            continue
+        alone = MultiLocalizer({key: one})
+
+        def localize(
+            names: Sequence[str], key: str = key, alone: MultiLocalizer = alone
+        ) -> list[Localization]:
+            some = [by_name[name] for name in names]
+            run = map_on_threads(partial(_localize_one, alone, gravity), some, workers or num_cores())
+            return [found[key] for found in run]
+
+        shared = share_cameras({name: task.cameras[key] for name, task in by_name.items()}, localize)
+        for name, camera in shared.items():
+            by_name[name] = by_name[name]._replace(cameras={**by_name[name].cameras, key: camera})
+    return list(by_name.values())
 
 
 def _localize_one(

@@ -19,9 +19,9 @@ FocalLength = Literal["auto", "known", "approximate", "unknown"]
 """How well the focal length of a query is known. If it is not known, it is estimated with the pose. auto: as
 well as its source says, see `CameraSource`."""
 
-CameraSource = Literal["given", "map", "exif", "unknown"]
-"""Where the intrinsics of a query come from: given by the user, the camera of the map, EXIF data, or nowhere.
-The first two are known, EXIF is approximate."""
+CameraSource = Literal["given", "map", "queries", "exif", "unknown"]
+"""Where the intrinsics of a query come from: given by the user, the camera of the map, several queries of one
+camera together, EXIF data, or nowhere. The first three are known, EXIF is approximate."""
 
 _GUESS = 1.2  # focal length over the longer side, the default of COLMAP
 

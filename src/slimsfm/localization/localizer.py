@@ -136,6 +136,9 @@ class Localization:
     camera_source: CameraSource = "given"
     """Where the intrinsics come from, apart from those that were estimated."""
 
+    camera_notes: tuple[str, ...] = ()
+    """Sentences that name the image, on what was ignored when its camera was chosen."""
+
     points2D: Points2D
     """Pixels of the 2D-3D matches that the pose was estimated from."""
 
@@ -277,6 +280,7 @@ class Localizer:
             pose=pose,
             camera=found.best.camera,
             camera_source=camera.source,
+            camera_notes=camera.notes,
             points2D=matches.pixels(query),
             points3D_in_world=self.map.points3D_in_world[matches.points],
             references=found.references,

@@ -29,7 +29,7 @@ ACCURATE = 0.006
 SETTLED = 0.8
 """Share of the previous round's predicted error above which further matches no longer help much."""
 
-TRUSTED: tuple[CameraSource, ...] = ("given", "map")
+TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
 
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
