@@ -141,7 +141,7 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
         "confidence: probability of a corner error below a tenth of the box's diagonal; "
         "predicted_corner_error: over the diagonal; "
         "position_bound_95 (map units), rotation_bound_95_deg: hold with 95 % probability; "
-        "camera_source: given, map, queries, exif or unknown; camera_estimated: intrinsics that the matches gave; "
+        "camera_source: given, map, queries, exif or unknown; camera_estimated: by the matches; "
         "covariance: of a turn (radians) and then a shift (map units) in the camera's frame; "
         "orientation: whether the camera is that of the upright image or of its stored pixels"
     )
