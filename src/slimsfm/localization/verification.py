@@ -153,7 +153,7 @@ class Verifier:
             found=self._found(query, points, pose, camera),
             uncalibrated_error=self._uncalibrated_error(pose),
             misfit=misfit(pose.check, pose.estimated) if pose.check else 0.0,
-            cells=_cells(query.keypoints if matches.points2D is None else matches.points2D, agreeing, camera),
+            cells=_cells(matches.pixels(query)[pose.inliers], camera),
             doubted=self._doubted(pose),
         )
 
@@ -202,9 +202,9 @@ def _doubtful_images(map: Map) -> Mask:
     return np.array([name in doubtful for name in map.images], bool)
 
 
-def _cells(keypoints: Points2D, agreeing: Ids, camera: pycolmap.Camera) -> int:
+def _cells(pixels: Points2D, camera: pycolmap.Camera) -> int:
     side_px = max(camera.width, camera.height) / _CELLS
-    return len(np.unique(np.floor(keypoints[agreeing] / side_px) @ (1.0, 1000.0)))
+    return len(np.unique(np.floor(pixels / side_px) @ (1.0, 1000.0)))
 
 
 def _count(keypoints: Ids) -> int:

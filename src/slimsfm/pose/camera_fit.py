@@ -33,8 +33,8 @@ from slimsfm.pose.types import (
 _NEAR = 2.5  # times the largest error of an inlier: a right match of a wrong camera may be that far off
 _CAUCHY = 2.385  # scale of the loss in sigmas
 _SHARPEST_PX = 0.3  # smallest sigma that a check assumes
-_DECREASES = {"focal length": 20.0, "principal point": 30.0, "pixel aspect ratio": 30.0}  # that convince
-_CHANGES = {"focal length": 0.02, "principal point": 0.03, "pixel aspect ratio": 0.03}  # that matter
+_DECREASES = {"focal length": 10.0, "principal point": 14.0, "pixel aspect ratio": 13.0}  # that convince
+_CHANGES = {"focal length": 0.03, "principal point": 0.03, "pixel aspect ratio": 0.03}  # that matter
 _PLACES = {
     "focal length": [0],
     "principal point": [1, 2],
@@ -42,7 +42,7 @@ _PLACES = {
 }  # among the intrinsics
 _FAR = 0.15  # change of the focal length from which it is searched for
 _FEW = 0.5  # share of inliers below which the focal length is searched for
-_UNKNOWN = np.array([0.3, 0.1, 0.1]) ** -2.0  # information on focal length and principal point of any image
+_UNKNOWN = np.array([0.3, 0.1, 0.1, 0.1]) ** -2.0  # information on the intrinsics of any image
 _LEAST = 8  # matches that a check needs
 
 FOCAL_LENGTH, PRINCIPAL_POINT, ASPECT_RATIO = _PLACES
@@ -83,7 +83,8 @@ def check_camera(
     motions = -np.linalg.solve(information[:FOCAL, :FOCAL], around)
     reduced = np.column_stack([information[FOCAL:, FOCAL:], gradient[FOCAL:]])
     reduced += information[FOCAL:, :FOCAL] @ motions  # of the intrinsics alone, with the pose that fits best
-    unsure = np.linalg.inv(reduced[:3, :3] + np.diag(_UNKNOWN))
+    unsure = np.linalg.inv(reduced[:, :-1] + np.diag(_UNKNOWN))
+    shift = unsure @ reduced[:, -1:]
     decreases, changes = {}, {}
     for name, places in _PLACES.items():
         others = reduced
@@ -93,7 +94,9 @@ def check_camera(
         step = np.linalg.solve(own[:, places], own[:, -1])
         decreases[name], changes[name] = float(own[:, -1] @ step), float(np.sqrt(step @ step))
     return CameraCheck(
-        decreases=decreases, changes=changes, growth=motions[:, :3] @ unsure @ motions[:, :3].T
+        decreases=decreases,
+        changes=changes,
+        growth=motions[:, :-1] @ (unsure + shift @ shift.T) @ motions[:, :-1].T,
     )
 
 

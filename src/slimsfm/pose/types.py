@@ -27,8 +27,8 @@ class CameraCheck:
     the logarithm of the aspect ratio."""
 
     growth: Float64[np.ndarray, "6 6"]
-    """What adds to the covariance of the pose if nothing but the matches says what focal length and principal
-    point are: large where a wrong camera could not be noticed."""
+    """Mean square of the motion of the pose if nothing but the matches said what the intrinsics are: large
+    where a wrong camera could not be noticed, and where others would fit better."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
