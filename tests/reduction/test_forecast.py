@@ -53,6 +53,7 @@ def prediction(errors, inliers=None):
         errors=np.array(errors, np.float64),
         inliers=np.array(inliers if inliers is not None else [9] * len(errors), np.int64),
         seconds=0.5,
+        rough_errors=np.zeros((len(errors), 0)),
     )
 
 
