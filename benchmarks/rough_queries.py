@@ -172,7 +172,7 @@ class Matched:
 
 
 def turns(pair: Pair, was: Matched) -> list[float]:
-    """Angles in degrees between the descriptors of keypoints that match and what is found there afterwards."""
+    """Angles in degrees between descriptors that match and those that are found there afterwards."""
     rows = np.array(list(was.point_of), np.int64)
     if not len(rows) or not len(pair.after):
         return []

@@ -14,6 +14,8 @@ from slimsfm.localization import (
     LocalizationOptions,
     Localizer,
     MultiLocalizer,
+    check_same_frame,
+    localize_failed,
     localize_images,
     localize_objects,
 )
@@ -32,6 +34,7 @@ def localize(
     /,
     output: OutputPath,
     also: tuple[Path, ...] = (),
+    full: Path | None = None,
     localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
     camera: Path | None = None,
@@ -46,6 +49,7 @@ def localize(
         images: A folder of images, or one image.
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
         also: Maps of further objects to find in the same images. Poses are then written as .json or .csv.
+        full: The full map that the map was reduced from, for images that the reduced one gives no pose.
         localization: How to localize.
         networks: Where learned methods run.
         camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map or from
@@ -57,15 +61,18 @@ def localize(
     """
     watch = Stopwatch()
     networks.apply()
-    check_output(output, map, images, *also, camera, gravity, overwrite=overwrite)
+    check_output(output, map, images, *also, full, camera, gravity, overwrite=overwrite)
     writer_for(output, several=bool(also))
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")
     if gravity and (also or localization.focal != "known"):
         raise InputError("gravity goes with one map and a known focal length; leave out also or focal")
+    if full and also:
+        raise InputError("full goes with one map; leave out also or full")
     localizers = {name: Localizer(read_map(path), localization) for name, path in _named(map, *also).items()}
     check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
     given = read_camera(camera) if camera else None
+    again: dict[str, Localization] = {}
     if also:
         multi = MultiLocalizer(localizers)
         by_object = localize_objects(multi, images, camera=given, workers=workers, progress=shown)
@@ -73,12 +80,21 @@ def localize(
     else:
         ((name, only),) = localizers.items()
         downward = read_gravity(gravity) if gravity else None
+        fallback = _full_map(full, only, localization) if full else None
         results = localize_images(
             only, images, camera=given, gravity=downward, workers=workers, progress=shown
         )
+        if fallback:
+            again = localize_failed(
+                fallback, results, images, camera=given, gravity=downward, workers=workers, progress=shown
+            )
+        results = {**results, **again}
         by_object = {name: results}
         write_poses(output, results, overwrite=overwrite)
     found = _print(by_object)
+    if again:
+        saved = sum(one.pose is not None for one in again.values())
+        console.print(f"{full}: gave {saved} of the {plural(len(again), 'pose')} that {map} did not")
     finish(f"{output}: {found} of {plural(len(next(iter(by_object.values()))), 'image')} localized", watch)
 
 
@@ -89,6 +105,13 @@ def _named(*paths: Path) -> dict[str, Path]:
     if len(set(names)) < len(names):
         raise InputError(f"also: the map {max(names, key=names.count)} is given twice")
     return dict(zip(names, paths, strict=True))
+
+
+def _full_map(path: Path, reduced: Localizer, options: LocalizationOptions) -> Localizer:
+    """The localizer of the full map that a map was reduced from."""
+    found = read_map(path)
+    check_same_frame(reduced.map, found)
+    return Localizer(found, options)
 
 
 def _print(by_object: Mapping[str, Mapping[str, Localization]]) -> int:

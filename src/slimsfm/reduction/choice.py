@@ -230,7 +230,7 @@ def _weights(choice: Choice, size: int) -> dict[str, int | float]:
 def _figures(one: Candidate) -> dict[str, int | float]:
     return {
         **_weights(one.choice, one.bytes),
-        "max_loss": max(one.loss, *one.rough_losses),
+        "max_loss": max((one.loss, *one.rough_losses)),
         "max_ms": 1e3 * one.seconds,
     }
 
