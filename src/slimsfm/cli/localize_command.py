@@ -1,6 +1,6 @@
 """`slimsfm localize`."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -91,7 +91,7 @@ def localize(
         results = {**results, **again}
         by_object = {name: results}
         write_poses(output, results, overwrite=overwrite)
-    found = _print(by_object)
+    found = _print(by_object, again)
     if again:
         saved = sum(one.pose is not None for one in again.values())
         console.print(f"{full}: gave {saved} of the {plural(len(again), 'pose')} that {map} did not")
@@ -114,14 +114,15 @@ def _full_map(path: Path, reduced: Localizer, options: LocalizationOptions) -> L
     return Localizer(found, options)
 
 
-def _print(by_object: Mapping[str, Mapping[str, Localization]]) -> int:
+def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collection[str]) -> int:
     """Print the outcome of each image and the mean times; return how many were localized in any map."""
     images = list(next(iter(by_object.values())))
     for image in images:
         for key, results in by_object.items():
             name = f"{image}, {key}" if len(by_object) > 1 else image
             console.print(
-                f"{name}: {_outcome(results[image])}", style=None if results[image].pose else "yellow"
+                f"{name}: {_outcome(results[image])}{', full map' * (image in again)}",
+                style=None if results[image].pose else "yellow",
             )
     seconds = [one.seconds for results in by_object.values() for one in results.values()]
     times = {

@@ -276,7 +276,8 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
         )
         console.print(
             f"{one.object}, {', '.join(one.after)} compared with {', '.join(one.before)}: {faster} in "
-            f"matching and pose ({one.faster_between.low:.1f} to {one.faster_between.high:.1f}), {smaller}; "
+            f"matching and pose ({one.faster_between.low:.1f} to {one.faster_between.high:.1f}), "
+            f"{format_ratio(one.faster_whole, 'faster', 'slower')} with extraction, {smaller}; "
             f"ADD-0.1d {one.add_before:.1f} -> {one.add_after:.1f} "
             f"({one.add_gain.low:+.1f} to {one.add_gain.high:+.1f}, p {format_p_value(one.p_value)})"
         )

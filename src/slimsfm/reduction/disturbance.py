@@ -3,7 +3,17 @@
 Queries in use are not as clean as the photos of a map. No image is read here: a disturbance removes matches
 and moves keypoints as disturbed photos were measured to lose and move them.
 
-`benchmarks/rough_queries.py` measures the parameters. MEASURED
+`benchmarks/rough_queries.py` measures the parameters, on photos of a building and of an object, every third a
+query. Of the right matches with the points of the map, by the scale s of the keypoint in pixels, there remain
+
+    s                    < 1    1    1.5    2     3     4     6 and more
+    1.5 px of blur      0.00  0.03  0.24  0.48  0.73  0.80  0.90
+    3 px of blur        0.00  0.00  0.00  0.03  0.25  0.48  0.73
+
+(means of the scenes, which differ by 0.02 to 0.2). Twice the blur removes twice as large keypoints, so the odds
+depend on s over sigma alone: they are its cube, and even at 1.7 sigma. What remains moves by 0.18 to 0.23 sigma.
+Of the wrong matches, 0.52 to 0.86 remain where 0.31 to 0.38 of the right ones do, because other keypoints
+replace lost ones. With 40 % hidden, 0.53 to 0.75 of the right and 0.72 to 1.06 of the wrong matches remain.
 """
 
 from dataclasses import dataclass
