@@ -195,7 +195,8 @@ def print_poses(scene: Scene, pairs: dict[str, list[Pair]]) -> None:
         print(
             f"reduced for {conditions} queries: {one.choice.method}, {len(reduced.map.point3D_ids)} points, "
             f"{size / 1000:.0f} kB, {scene.bytes / size:.0f}x smaller, in {seconds:.1f} s; "
-            f"predicted loss {one.loss:.1f}, rough {one.rough_loss:.1f}",
+            f"predicted loss {one.loss:.1f}"
+            f"{'' if one.rough_loss is None else f', rough {one.rough_loss:.1f}'}",
             flush=True,
         )
     for name, some in pairs.items():

@@ -10,10 +10,10 @@ query. Of the right matches with the points of the map, by the scale s of the ke
     1.5 px of blur      0.00  0.03  0.24  0.48  0.73  0.80  0.90
     3 px of blur        0.00  0.00  0.00  0.03  0.25  0.48  0.73
 
-(means of the scenes, which differ by 0.02 to 0.2). Twice the blur removes twice as large keypoints, so the odds
-depend on s over sigma alone: they are its cube, and even at 1.7 sigma. What remains moves by 0.18 to 0.23 sigma.
-Of the wrong matches, 0.52 to 0.86 remain where 0.31 to 0.38 of the right ones do, because other keypoints
-replace lost ones. With 40 % hidden, 0.53 to 0.75 of the right and 0.72 to 1.06 of the wrong matches remain.
+(means of the scenes, which differ by 0.02 to 0.2). Twice the blur removes keypoints twice as large, so the
+odds depend on s over sigma alone: they are its cube, and even at 1.7 sigma. What remains moves by 0.18 to
+0.23 sigma. Of the wrong matches, 0.52 to 0.86 remain where 0.31 to 0.38 of the right ones do, because other
+keypoints replace lost ones. With 40 % hidden, 0.53 to 0.75 of the right and 0.72 to 1.06 of the wrong remain.
 """
 
 from dataclasses import dataclass
