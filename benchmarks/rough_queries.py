@@ -129,6 +129,8 @@ def print_matches(references: Map, pairs: dict[str, list[Pair]]) -> None:
         by_size = defaultdict(list)
         moved, turned, wrong = [], [], np.zeros(2)
         for pair in some:
+            if pair.before.frames is None:
+                raise SystemExit("the keypoints have no scales; use maps of SIFT")
             was, now = (Matched.of(references, one, pair, target) for one in (pair.before, pair.after))
             wrong += was.wrong, now.wrong
             turned += turns(pair, was)
