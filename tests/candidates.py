@@ -8,21 +8,44 @@ TESTS = 20
 MISSED = 4  # by the full map
 
 
-def prediction(missed, seconds=0.01, error=0.001):
-    """A prediction of twenty tests: each missed test costs five percentage points."""
+FULL_BYTES = 100_000
+
+
+def prediction(missed, seconds=0.01, error=0.001, rough=None):
+    """A prediction of twenty tests: each missed test costs five percentage points.
+
+    If `rough` is given, so many are missed after one disturbance.
+    """
     errors = np.where(np.arange(TESTS) < missed, np.inf, error)
     tests = tuple(f"{i}.png" for i in range(TESTS))
     inliers = np.where(np.isfinite(errors), 30, 0).astype(np.int64)
-    return Prediction(tests=tests, errors=errors, inliers=inliers, seconds=seconds)
+    columns = [] if rough is None else [np.where(np.arange(TESTS) < rough, np.inf, error)]
+    return Prediction(
+        tests=tests,
+        errors=errors,
+        inliers=inliers,
+        seconds=seconds,
+        rough_errors=np.array(columns, np.float64).reshape(len(columns), TESTS).T,
+    )
 
 
 FULL = prediction(MISSED, seconds=1.0)
+FULL_ROUGH = prediction(MISSED, seconds=1.0, rough=MISSED)
 
 
 def candidate(
-    *, use="direct", method="kcover", points=100, images=0, size=1000, missed=0, ms=10.0, error=0.001
+    *,
+    use="direct",
+    method="kcover",
+    points=100,
+    images=0,
+    size=1000,
+    missed=0,
+    ms=10.0,
+    error=0.001,
+    rough=None,
 ):
-    """A candidate that misses `missed` more tests than the full map."""
+    """A candidate that misses `missed` more tests than the full map, and `rough` more after a disturbance."""
     return Candidate(
         choice=Choice(
             use=use,
@@ -32,10 +55,15 @@ def candidate(
             points=np.arange(points),
         ),
         bytes=size,
-        prediction=prediction(MISSED + missed, seconds=1e-3 * ms, error=error),
-        full=FULL,
+        prediction=prediction(
+            MISSED + missed,
+            seconds=1e-3 * ms,
+            error=error,
+            rough=None if rough is None else MISSED + rough,
+        ),
+        full=FULL if rough is None else FULL_ROUGH,
     )
 
 
 def frontier_of(*candidates):
-    return Frontier(full=FULL, candidates=candidates)
+    return Frontier(full=FULL, candidates=candidates, bytes=FULL_BYTES)

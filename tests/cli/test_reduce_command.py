@@ -71,9 +71,12 @@ def refused(small, tmp_path):
 
 def test_without_options_it_keeps_points_for_direct_matching(boulder, pointed):
     assert (pointed.outcome.code, pointed.outcome.err.strip()) == (0, "")
-    *_, promise, last, next_line = pointed.outcome.out.splitlines()
+    *_, promise, speed, last, next_line = pointed.outcome.out.splitlines()
     assert "predicted to localize 1" in promise
-    assert f"faster (measured on {MAPPING_FRAMES} images left out)" in promise
+    assert "after 40 % hidden of what the full map does" in promise
+    assert f"(measured on {MAPPING_FRAMES} images left out)" in promise
+    assert " than exhaustive on the full map (" in speed
+    assert " than progressive, the default of localize, on the full map (" in speed
     assert last.startswith(f"{pointed.path}: written in ")
     assert next_line == f"next: slimsfm localize {pointed.path} IMAGES -o poses.json"
     full, slim = boulder.map, read_map(pointed.path)

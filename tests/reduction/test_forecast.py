@@ -10,6 +10,7 @@ from scenes import exact_map
 from slimsfm.features import unit_rows
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import Prediction, Trials
+from slimsfm.reduction.disturbance import ROUGH
 from slimsfm.reduction.forecast import handicap
 from slimsfm.selection.usable_points import LeftOut
 
@@ -53,6 +54,7 @@ def prediction(errors, inliers=None):
         errors=np.array(errors, np.float64),
         inliers=np.array(inliers if inliers is not None else [9] * len(errors), np.int64),
         seconds=0.5,
+        rough_errors=np.zeros((len(errors), 0)),
     )
 
 
@@ -130,6 +132,24 @@ def test_equal_maps_give_equal_predictions(partial):
         assert a.tests == b.tests
         assert np.array_equal(a.errors, b.errors)
         assert np.array_equal(a.inliers, b.inliers)
+
+
+def test_rough_queries_are_predicted_only_on_request(partial):
+    rows = rows_of(partial)
+    rough, clean = trials_of(partial), Trials(partial, LeftOut(partial), conditions="clean")
+    found, plain = rough.points(rows), clean.points(rows)
+    assert np.array_equal(found.errors, plain.errors)
+    assert found.rough_errors.shape == (len(found.tests), len(ROUGH))
+    assert plain.rough_within(0.1) == ()
+    again = trials_of(partial).points(rows)
+    assert np.array_equal(found.rough_errors, again.rough_errors)
+
+
+def test_rough_queries_need_more_points(partial):
+    order = np.random.default_rng(0).permutation(rows_of(partial))
+    many, few = (trials_of(partial).points(np.sort(order[:size])) for size in (200, 60))
+    assert np.mean(few.rough_within(0.1)) < np.mean(many.rough_within(0.1)) <= many.within(0.1)
+    assert np.mean(few.rough_within(0.1)) < few.within(0.1)
 
 
 def test_fewer_points_give_no_more_inliers(partial):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from candidates import MISSED, candidate, frontier_of
+from candidates import FULL_BYTES, MISSED, candidate, frontier_of
 from slimsfm.errors import InputError
 from slimsfm.reduction import ReductionLimits, recommend
 
@@ -142,6 +142,35 @@ def test_of_as_many_points_those_of_the_least_error_are_taken():
     one, two = candidate(error=0.002, size=990), candidate(error=0.001, method="information")
     assert recommend(frontier_of(one, two), "direct") is two
     assert recommend(frontier_of(one, two), "direct", ReductionLimits(max_loss=0.0)) is two
+
+
+def test_a_choice_that_loses_rough_queries_is_replaced_by_the_smallest_that_does_not():
+    small = candidate(points=100, size=900, rough=5)
+    reserved = candidate(points=200, size=1200, rough=3)
+    better = candidate(points=300, size=1500, method="information", rough=0)
+    larger = candidate(points=400, size=1900, rough=-1)
+    assert recommend(frontier_of(small, reserved, better, larger), "direct") is better
+    lossy = candidate(points=300, size=1500, missed=1, rough=0)
+    assert recommend(frontier_of(small, reserved, lossy, larger), "direct") is larger
+    enough = candidate(points=200, size=1200, rough=0)
+    assert recommend(frontier_of(small, enough, better), "direct") is enough
+
+
+def test_a_reserve_for_rough_queries_stays_fifty_times_smaller_than_the_full_map():
+    small = candidate(points=100, size=900, rough=5)
+    half = candidate(points=300, size=FULL_BYTES // 50, rough=2)
+    whole = candidate(points=400, size=FULL_BYTES // 50 + 1, rough=0)
+    assert recommend(frontier_of(small, half, whole), "direct") is half
+    assert recommend(frontier_of(small, whole), "direct") is whole  # twice the points of the smallest
+    assert recommend(frontier_of(candidate(points=250, rough=5), whole), "direct").choice.points.size == 250
+
+
+def test_a_largest_loss_holds_for_rough_queries_too():
+    small, large = candidate(rough=1, size=500), candidate(points=200, rough=0)
+    assert recommend(frontier_of(small, large), "direct", ReductionLimits(max_loss=0.0)) is large
+    assert recommend(frontier_of(small, large), "direct", ReductionLimits(max_loss=5.0)) is small
+    with pytest.raises(InputError, match=r"loses 0\.0 points \(5\.0 on rough queries\)"):
+        recommend(frontier_of(small), "direct", ReductionLimits(max_loss=1.0))
 
 
 def test_images_need_no_reserve():

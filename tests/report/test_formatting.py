@@ -27,6 +27,7 @@ COMPARISON = Comparison(
     add_gain=Interval(-2.5, 0.0),
     p_value=0.4,
     faster=14.2,
+    faster_whole=3.0,
     faster_between=Interval(13.0, 15.0),
     smaller=860.3,
 )

@@ -7,11 +7,18 @@ from typing import Annotated
 from slimsfm.cli.arguments import Execution
 from slimsfm.cli.options import Advanced, MapPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
-from slimsfm.cli.tables import frontier_to_json, kept_graph, print_frontier, promise, read_reducible
+from slimsfm.cli.tables import (
+    frontier_to_json,
+    kept_graph,
+    print_frontier,
+    print_speed,
+    promise,
+    read_reducible,
+)
 from slimsfm.files import replacing
 from slimsfm.mapping.io import bytes_by_part
 from slimsfm.progress import shown
-from slimsfm.reduction import FrontierOptions, frontier, recommend
+from slimsfm.reduction import FrontierOptions, apply_choice, frontier, recommend
 from slimsfm.report.figures import check_figure, save_figure
 from slimsfm.report.tradeoffs import curves_figure
 
@@ -48,6 +55,7 @@ def frontier_of(
     print_frontier(found, recommended, size)
     for use, one in recommended.items():
         console.print(f"for {use}: {one.choice.method}, {one.choice.detail}: {promise(map, full, one)}")
+        print_speed(full, apply_choice(full, one.choice), f" for {use}")
     if json:
         with replacing(json, overwrite=overwrite) as partial:
             data = frontier_to_json(found, recommended, full, size)

@@ -1,6 +1,6 @@
 """`slimsfm localize`."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +14,8 @@ from slimsfm.localization import (
     LocalizationOptions,
     Localizer,
     MultiLocalizer,
+    check_same_frame,
+    localize_failed,
     localize_images,
     localize_objects,
 )
@@ -32,6 +34,7 @@ def localize(
     /,
     output: OutputPath,
     also: tuple[Path, ...] = (),
+    full: Path | None = None,
     localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
     camera: Path | None = None,
@@ -46,6 +49,7 @@ def localize(
         images: A folder of images, or one image.
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
         also: Maps of further objects to find in the same images. Poses are then written as .json or .csv.
+        full: The full map that the map was reduced from, for images that the reduced one gives no pose.
         localization: How to localize.
         networks: Where learned methods run.
         camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map where
@@ -57,28 +61,33 @@ def localize(
     """
     watch = Stopwatch()
     networks.apply()
-    check_output(output, map, images, *also, camera, gravity, overwrite=overwrite)
+    check_output(output, map, images, *also, full, camera, gravity, overwrite=overwrite)
     writer_for(output, several=bool(also))
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")
-    if gravity and also:
-        raise InputError("gravity goes with one map; leave out also")
+    for name, value in (("gravity", gravity), ("full", full)):
+        if value and also:
+            raise InputError(f"{name} goes with one map; leave out also or {name}")
     localizers = {name: Localizer(read_map(path), localization) for name, path in _named(map, *also).items()}
     check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
     given = read_camera(camera) if camera else None
+    again: dict[str, Localization] = {}
+    shared = {"camera": given, "workers": workers, "progress": shown}
     if also:
-        multi = MultiLocalizer(localizers)
-        by_object = localize_objects(multi, images, camera=given, workers=workers, progress=shown)
+        by_object = localize_objects(MultiLocalizer(localizers), images, **shared)
         write_object_poses(output, by_object, overwrite=overwrite)
     else:
         ((name, only),) = localizers.items()
-        downward = read_gravity(gravity) if gravity else None
-        results = localize_images(
-            only, images, camera=given, gravity=downward, workers=workers, progress=shown
-        )
-        by_object = {name: results}
-        write_poses(output, results, overwrite=overwrite)
-    found = _print(by_object)
+        shared["gravity"] = read_gravity(gravity) if gravity else None
+        fallback = _full_map(full, only, localization) if full else None
+        results = localize_images(only, images, **shared)
+        again = localize_failed(fallback, results, images, **shared) if fallback else {}
+        by_object = {name: {**results, **again}}
+        write_poses(output, by_object[name], overwrite=overwrite)
+    found = _print(by_object, again)
+    if again:
+        saved = sum(one.pose is not None for one in again.values())
+        console.print(f"{full}: gave {saved} of the {plural(len(again), 'pose')} that {map} did not")
     finish(f"{output}: {found} of {plural(len(next(iter(by_object.values()))), 'image')} localized", watch)
 
 
@@ -91,7 +100,14 @@ def _named(*paths: Path) -> dict[str, Path]:
     return dict(zip(names, paths, strict=True))
 
 
-def _print(by_object: Mapping[str, Mapping[str, Localization]]) -> int:
+def _full_map(path: Path, reduced: Localizer, options: LocalizationOptions) -> Localizer:
+    """The localizer of the full map that a map was reduced from."""
+    found = read_map(path)
+    check_same_frame(reduced.map, found)
+    return Localizer(found, options)
+
+
+def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collection[str]) -> int:
     """Print the outcome of each image and the mean times; return how many were localized in any map."""
     images = list(next(iter(by_object.values())))
     every = (one for results in by_object.values() for one in results.values())
@@ -101,7 +117,8 @@ def _print(by_object: Mapping[str, Mapping[str, Localization]]) -> int:
         for key, results in by_object.items():
             name = f"{image}, {key}" if len(by_object) > 1 else image
             console.print(
-                f"{name}: {_outcome(results[image])}", style=None if results[image].pose else "yellow"
+                f"{name}: {_outcome(results[image])}{', full map' * (image in again)}",
+                style=None if results[image].pose else "yellow",
             )
     seconds = [one.seconds for results in by_object.values() for one in results.values()]
     times = {

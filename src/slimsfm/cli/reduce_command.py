@@ -7,11 +7,18 @@ from typing import Annotated
 from slimsfm.cli.arguments import Execution
 from slimsfm.cli.options import Advanced, Flags, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish
-from slimsfm.cli.tables import kept_graph, print_change, print_dominating_set, promise, read_reducible
+from slimsfm.cli.tables import (
+    kept_graph,
+    print_change,
+    print_dominating_set,
+    print_speed,
+    promise,
+    read_reducible,
+)
 from slimsfm.errors import InputError
 from slimsfm.mapping.io import write_map
 from slimsfm.progress import shown
-from slimsfm.reduction import ImageOptions, ReduceOptions, ReductionLimits
+from slimsfm.reduction import Conditions, ImageOptions, ReduceOptions, ReductionLimits
 from slimsfm.reduction import reduce as reduce_map
 from slimsfm.reduction.reduced import Use
 
@@ -24,7 +31,7 @@ class LimitArguments:
 
     max_loss: str | None = None
     """Largest loss against the full map in percentage points, such as 1%. By default nothing may be lost, and
-    twice as many points as that needs are kept."""
+    twice as many points as that needs are kept, or more for blurred and half hidden queries."""
 
     max_bytes: str | None = None
     """Largest size on disk, such as 100kB."""
@@ -95,6 +102,10 @@ class ReduceArguments:
     image_choice: ImageOptions = ImageOptions()
     """How images are chosen."""
 
+    conditions: Conditions = "rough"
+    """Queries that losses are predicted for: only some as clean as the map's photos (clean), or blurred and
+    partly hidden ones too (rough), for which more points are kept where they need them."""
+
     seed: int = 0
     """Seed of all random choices."""
 
@@ -109,6 +120,7 @@ class ReduceArguments:
             selector=self.selector,
             limits=self.limits.limits,
             image_choice=self.image_choice,
+            conditions=self.conditions,
             seed=self.seed,
         )
 
@@ -145,4 +157,5 @@ def reduce(
     print_change(map, full, output, reduced.map)
     for one in reduced.forecast.values():
         console.print(f"{one.choice.method} ({one.choice.detail}): {promise(map, full, one)}")
+    print_speed(full, reduced.map)
     finish(f"{output}: written", watch, "localize", output, "IMAGES", "-o", "poses.json")

@@ -19,7 +19,16 @@ from slimsfm.graph import GraphOptions, ReferenceGraph, load_or_compute_graph
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
 from slimsfm.progress import shown
-from slimsfm.reduction import Candidate, Frontier, GraphProvider, Prediction, Reduced, ReduceOptions
+from slimsfm.reduction import (
+    Candidate,
+    Frontier,
+    GraphProvider,
+    Prediction,
+    Reduced,
+    ReduceOptions,
+    measure_speed,
+)
+from slimsfm.reduction.disturbance import ROUGH
 from slimsfm.reduction.pareto import check_reducible
 from slimsfm.report.formatting import format_ratio
 
@@ -85,12 +94,36 @@ def promise(full_path: Path, full: Map, candidate: Candidate) -> str:
     after = f"{images}{plural(len(choice.points), 'point')}, {size(candidate.bytes)}"
     if not tests:
         return f"{before} -> {after}; no image is left out to predict by"
-    found = candidate.full.within(ADD_FRACTIONS[0])
-    share = 100 * candidate.prediction.within(ADD_FRACTIONS[0]) / found if found else 0.0
+    shares = [_share(candidate.prediction.within(ADD_FRACTIONS[0]), candidate.full.within(ADD_FRACTIONS[0]))]
+    rough = (one.rough_within(ADD_FRACTIONS[0]) for one in (candidate.prediction, candidate.full))
+    for disturbance, slim, best in zip(ROUGH, *rough, strict=False):
+        shares.append(f"{_share(slim, best)} after {disturbance.name}")
     return (
-        f"{before} -> {after}; predicted to localize {min(share, 100):.3g} % of what the full map does, "
-        f"{candidate.full.seconds / candidate.seconds:.3g}x faster "
+        f"{before} -> {after}; predicted to localize {', '.join(shares)} of what the full map does "
         f"(measured on {plural(tests, 'image')} left out)"
+    )
+
+
+def _share(part: float, whole: float) -> str:
+    return f"{min(100 * part / whole, 100) if whole else 0:.3g} %"
+
+
+def print_speed(full: Map, slim: Map, use: str = "") -> None:
+    """Measure and print how much faster queries are with a reduced map than with the full one."""
+    speed = measure_speed(full, slim) if full.has_keypoints else None
+    if speed is None:
+        return
+    ways = [(speed.exhaustive, "exhaustive")]
+    if speed.strategy != "exhaustive":
+        ways.append((speed.default, f"{speed.strategy}, the default of localize,"))
+    compared = ", ".join(
+        f"{format_ratio(seconds / speed.slim, 'faster', 'slower')} than {way} on the full map "
+        f"({1e3 * seconds:.3g} ms)"
+        for seconds, way in ways
+    )
+    console.print(
+        f"matching and pose{use}: {1e3 * speed.slim:.3g} ms, {compared}; "
+        f"medians of {plural(speed.tests, 'image')} left out, without extraction of features"
     )
 
 
@@ -101,28 +134,33 @@ def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], ful
         table.add_column(column)
     for column in ("images", "points", "size", *(f"{fraction}d" for fraction in ADD_FRACTIONS)):
         table.add_column(column, justify="right")
-    for column in ("loss", "median", "match+pose", ""):
+    for column in ("loss", "rough loss", "median", "match+pose", ""):
         table.add_column(column, justify="right" if column else "left")
-    table.add_row("", "full map", "", "", "", size(full_bytes), *_figures(frontier.full, 0.0))
+    full = _figures(frontier.full, 0.0, 0.0 if frontier.full.rough_errors.size else None)
+    table.add_row("", "full map", "exhaustive", "", "", size(full_bytes), *full)
     for one in sorted(frontier.candidates, key=lambda one: (one.choice.use, one.choice.method, one.bytes)):
         remark, style = _remark(frontier, recommended, one)
         choice = one.choice
         what = (choice.use, choice.method, choice.detail, str(len(choice.images) or ""))
         weight = (str(len(choice.points)), size(one.bytes))
-        table.add_row(*what, *weight, *_figures(one.prediction, one.loss), remark, style=style)
+        table.add_row(
+            *what, *weight, *_figures(one.prediction, one.loss, one.rough_loss), remark, style=style
+        )
     console.print(table)
     console.print(
         f"0.1d, 0.05d, 0.02d: % of {len(frontier.full.tests)} images or fewer, left out and given fewer "
         "matches, whose mean corner error is below this share of the diagonal d; loss: percentage points "
-        "lost against the full map on the same images, the largest of the three; Pareto-dominated: another "
-        "choice for the same use is not larger and loses no more",
+        "lost against the full map on the same images, the largest of the three; rough loss: within 0.1d, "
+        f"the largest of {' and '.join(one.name for one in ROUGH)}; match+pose: median per query; "
+        "Pareto-dominated: another choice for the same use is not larger and loses no more",
         style="dim",
     )
 
 
-def _figures(prediction: Prediction, loss: float) -> list[str]:
+def _figures(prediction: Prediction, loss: float, rough_loss: float | None) -> list[str]:
     shares = [f"{prediction.within(fraction):.1f}" for fraction in ADD_FRACTIONS]
-    return [*shares, f"{loss:.1f}", f"{prediction.median_error:.4f}d", f"{1e3 * prediction.seconds:.2f} ms"]
+    losses = [f"{loss:.1f}", "" if rough_loss is None else f"{rough_loss:.1f}"]
+    return [*shares, *losses, f"{prediction.median_error:.4f}d", f"{1e3 * prediction.seconds:.2f} ms"]
 
 
 def _remark(
@@ -149,6 +187,7 @@ def frontier_to_json(
                 "points": len(one.choice.points),
                 "bytes": one.bytes,
                 "loss": one.loss,
+                "rough_loss": one.rough_loss,
                 "dominated": frontier.is_pareto_dominated(one),
                 "recommended": any(best is one for best in recommended.values()),
                 **_prediction_to_json(one.prediction),
@@ -163,6 +202,10 @@ def _prediction_to_json(prediction: Prediction) -> dict:
     return {
         "tests": len(prediction.tests),
         **{f"add_{fraction}d": prediction.within(fraction) for fraction in ADD_FRACTIONS},
+        "rough_add_0.1d": {
+            one.name: share
+            for one, share in zip(ROUGH, prediction.rough_within(ADD_FRACTIONS[0]), strict=False)
+        },
         "median_corner_error": median if np.isfinite(median) else None,
         "ms": 1e3 * prediction.seconds,
     }
@@ -233,7 +276,8 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
         )
         console.print(
             f"{one.object}, {', '.join(one.after)} compared with {', '.join(one.before)}: {faster} in "
-            f"matching and pose ({one.faster_between.low:.1f} to {one.faster_between.high:.1f}), {smaller}; "
+            f"matching and pose ({one.faster_between.low:.1f} to {one.faster_between.high:.1f}), "
+            f"{format_ratio(one.faster_whole, 'faster', 'slower')} with extraction, {smaller}; "
             f"ADD-0.1d {one.add_before:.1f} -> {one.add_after:.1f} "
             f"({one.add_gain.low:+.1f} to {one.add_gain.high:+.1f}, p {format_p_value(one.p_value)})"
         )

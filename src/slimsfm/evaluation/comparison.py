@@ -50,6 +50,9 @@ class Comparison:
     faster_between: Interval
     """95 % interval of the speedup."""
 
+    faster_whole: float
+    """Speedup of the whole query, with the extraction of features."""
+
     smaller: float
     """Size of the map of the baseline, divided by that of the other row."""
 
@@ -69,6 +72,7 @@ class Comparison:
             "faster": self.faster,
             "faster_low": self.faster_between.low,
             "faster_high": self.faster_between.high,
+            "faster_whole": self.faster_whole,
             "smaller": self.smaller,
         }
 
@@ -101,6 +105,7 @@ def compare_measurements(name: str, pairs: Sequence[tuple[Measurement, Measureme
         p_value=paired_p_value(values[:, 2], values[:, 0]),
         faster=time_before / time_after,
         faster_between=faster,
+        faster_whole=_whole_seconds([one for one, _ in pairs]) / _whole_seconds([one for _, one in pairs]),
         smaller=_map_bytes([one for one, _ in pairs]) / _map_bytes([one for _, one in pairs]),
     )
 
@@ -110,6 +115,12 @@ def _values(one: Measurement) -> Float64[np.ndarray, "queries 2"]:
     outcomes = one.outcomes
     right, seconds = outcomes.error < ADD_FRACTIONS[0], outcomes.seconds[:, 1:].sum(axis=1)
     return np.column_stack([mean_over_draws(one, right), mean_over_draws(one, seconds)])
+
+
+def _whole_seconds(some: Sequence[Measurement]) -> float:
+    return float(
+        np.concatenate([mean_over_draws(one, one.outcomes.seconds.sum(axis=1)) for one in some]).mean()
+    )
 
 
 def _map_bytes(some: Sequence[Measurement]) -> float:

@@ -1,6 +1,7 @@
 """Localize query images against a map: load the map once, localize many images."""
 
 from slimsfm.localization.batch import MultiLocalizer, localize_images, localize_objects
+from slimsfm.localization.fallback import check_same_frame, localize_failed
 from slimsfm.localization.localizer import STRATEGIES, Localization, LocalizationOptions, Localizer, Seconds
 
 __all__ = [
@@ -10,6 +11,8 @@ __all__ = [
     "Localizer",
     "MultiLocalizer",
     "Seconds",
+    "check_same_frame",
+    "localize_failed",
     "localize_images",
     "localize_objects",
 ]

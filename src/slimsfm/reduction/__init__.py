@@ -9,6 +9,7 @@ from slimsfm.reduction.choice import (
     points_seen,
     recommend,
 )
+from slimsfm.reduction.disturbance import Conditions
 from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.image_sets import (
     DominatingSetOptions,
@@ -19,11 +20,13 @@ from slimsfm.reduction.image_sets import (
 )
 from slimsfm.reduction.pareto import USES, FrontierOptions, GraphProvider, forecast_images, frontier
 from slimsfm.reduction.reduced import ImageOptions, Reduced, ReduceOptions, reduce
+from slimsfm.reduction.speed import Speed, measure_speed
 
 __all__ = [
     "USES",
     "Candidate",
     "Choice",
+    "Conditions",
     "DominatingSetOptions",
     "Frontier",
     "FrontierOptions",
@@ -33,6 +36,7 @@ __all__ = [
     "ReduceOptions",
     "Reduced",
     "ReductionLimits",
+    "Speed",
     "Trials",
     "apply_choice",
     "dominating_set",
@@ -41,6 +45,7 @@ __all__ = [
     "image_order",
     "images_within",
     "keep_random_images",
+    "measure_speed",
     "points_seen",
     "recommend",
     "reduce",

@@ -61,8 +61,19 @@ class Candidate:
 
     @property
     def loss(self) -> float:
-        """The largest of the losses, in percentage points."""
+        """The largest of the losses on clean queries, in percentage points."""
         return max(self.losses)
+
+    @cached_property
+    def rough_losses(self) -> tuple[float, ...]:
+        """Percentage points lost within 0.1 d after each disturbance; empty if none was tried."""
+        full, slim = (one.rough_within(ADD_FRACTIONS[0]) for one in (self.full, self.prediction))
+        return tuple(a - b for a, b in zip(full, slim, strict=True))
+
+    @property
+    def rough_loss(self) -> float | None:
+        """The largest of the losses on disturbed queries, in percentage points; None if none was tried."""
+        return max(self.rough_losses, default=None)
 
     @property
     def seconds(self) -> float:
@@ -79,6 +90,9 @@ class Frontier:
 
     candidates: tuple[Candidate, ...]
     """The choices with their sizes and predictions, by use and method."""
+
+    bytes: int
+    """Size of the full map on disk."""
 
     def is_pareto_dominated(self, one: Candidate) -> bool:
         """Whether another candidate for the same use is not larger, loses no more, and is better in one."""
@@ -111,6 +125,8 @@ def points_seen(map: Map, images: tuple[str, ...]) -> Ids:
 
 
 _RESERVE = 2.0  # times the points of the smallest candidate that loses nothing
+_ROUGH_LOSS = 2.0  # percentage points: forecasts are a few points too optimistic, and 5 may be lost
+_LEAST_FACTOR = 50  # a reserve for rough queries leaves the map so many times smaller than the full one
 _TINY = 1e-9
 
 
@@ -119,8 +135,8 @@ class ReductionLimits:
     """Limits of a reduced map; the smallest candidate within them is taken."""
 
     max_loss: float | None = None
-    """Largest loss against the full map within each of 0.1, 0.05 and 0.02 d, in percentage points; None: the
-    least possible, with a reserve."""
+    """Largest loss against the full map within each of 0.1, 0.05 and 0.02 d, in percentage points, and within
+    0.1 d on rough queries if these are predicted; None: the least possible, with a reserve."""
 
     max_bytes: float | None = None
     """Largest size of the map on disk, in bytes."""
@@ -156,6 +172,10 @@ def recommend(frontier: Frontier, use: str, limits: ReductionLimits = ReductionL
     same method with twice as many points, if there is one: queries resemble the references less than these
     resemble each other. If every candidate loses something, the one that loses least is taken.
 
+    If rough queries were predicted, and that choice loses more than 2 points on them, it is replaced by the
+    smallest one that neither does that nor loses more on clean queries. Such a map has at most a fiftieth of
+    the full map's bytes; if none of this size suffices, the one that loses least on rough queries is taken.
+
     Raises:
         InputError: No candidate meets the limits.
     """
@@ -166,14 +186,15 @@ def recommend(frontier: Frontier, use: str, limits: ReductionLimits = ReductionL
     if not fitting:
         nearest = min(usable, key=lambda one: (_excess(_figures(one), limits), _size(one)))
         raise InputError(
-            f"{_refusal(nearest.choice, nearest.bytes, limits)}, loses {nearest.loss:.1f} points "
-            f"and takes {1e3 * nearest.seconds:.2g} ms"
+            f"{_refusal(nearest.choice, nearest.bytes, limits)}, loses {nearest.loss:.1f} points"
+            f"{_rough(nearest)} and takes {1e3 * nearest.seconds:.2g} ms"
         )
     if limits.max_loss is not None:
         return min(fitting, key=_size)
     least = max(min(one.loss for one in fitting), 0.0)
-    smallest = min((one for one in fitting if one.loss <= least), key=_size)
-    return _with_reserve(smallest, fitting)
+    lossless = [one for one in fitting if one.loss <= least]
+    reserved = _with_reserve(min(lossless, key=_size), fitting)
+    return _for_rough(reserved, lossless, frontier.bytes / _LEAST_FACTOR)
 
 
 def check_reachable(
@@ -207,7 +228,11 @@ def _weights(choice: Choice, size: int) -> dict[str, int | float]:
 
 
 def _figures(one: Candidate) -> dict[str, int | float]:
-    return {**_weights(one.choice, one.bytes), "max_loss": one.loss, "max_ms": 1e3 * one.seconds}
+    return {
+        **_weights(one.choice, one.bytes),
+        "max_loss": max((one.loss, *one.rough_losses)),
+        "max_ms": 1e3 * one.seconds,
+    }
 
 
 def _excess(figures: dict[str, int | float], limits: ReductionLimits) -> float:
@@ -235,6 +260,26 @@ def _with_reserve(smallest: Candidate, fitting: list[Candidate]) -> Candidate:
         and one.choice.use == "direct"
     ]
     return min(larger, key=_size, default=smallest)
+
+
+def _rough(one: Candidate) -> str:
+    return "" if one.rough_loss is None else f" ({one.rough_loss:.1f} on rough queries)"
+
+
+def _for_rough(reserved: Candidate, lossless: list[Candidate], most_bytes: float) -> Candidate:
+    """The candidate with a reserve, or a larger one if it loses too much on rough queries."""
+    if _rough_excess(reserved) == 0:
+        return reserved
+    larger = [
+        one
+        for one in lossless
+        if len(one.choice.points) > len(reserved.choice.points) and one.bytes <= most_bytes
+    ]
+    return min([reserved, *larger], key=lambda one: (_rough_excess(one), _size(one)))
+
+
+def _rough_excess(one: Candidate) -> float:
+    return max((one.rough_loss or 0.0) - _ROUGH_LOSS, 0.0)
 
 
 def _refusal(nearest: Choice, size: int, limits: ReductionLimits) -> str:

@@ -3,7 +3,7 @@
 A reference whose own observations are removed from the map is a query of known pose. The errors, inliers and
 times of localizing many of them predict those of real queries. Queries resemble the references less than
 these resemble each other, so each test is handicapped: a random share of its correct matches, between none
-and half, is removed.
+and half, is removed. Under rough conditions, each test is also blurred and partly hidden, see `disturbance`.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -12,23 +12,24 @@ from functools import lru_cache
 from time import perf_counter
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float64
 from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
-from slimsfm.arrays import Ids, Mask
+from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
 from slimsfm.localization.matching import match_target, reference_target
-from slimsfm.localization.strategy import Target, unite
+from slimsfm.localization.strategy import PointMatches, Target, unite
 from slimsfm.mapping.descriptors import quantize
 from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.reduction.disturbance import GOLDEN, ROUGH, Conditions, Disturbance, Keypoints, disturbed
 from slimsfm.selection.usable_points import LeftOut
 
 _MOST_TESTS = 60
 _LOST = 0.5  # largest share of correct matches that is removed
-_GOLDEN = (5**0.5 - 1) / 2  # its multiples fill the unit interval evenly
 _MOST_REFERENCES = 60  # matched per test with the full map: those with the most common points
 
 
@@ -46,20 +47,29 @@ class Prediction:
     """Number of inliers of each test; 0 without a pose."""
 
     seconds: float
-    """Mean time of matching and pose per query."""
+    """Median time of matching and pose per query."""
+
+    rough_errors: Float64[np.ndarray, "tests disturbances"]
+    """Relative corner error of each test after each disturbance; no columns if none was tried."""
 
     def within(self, fraction: float) -> float:
         """Percentage of the tests whose relative corner error is below a fraction."""
         return 100 * float(np.mean(self.errors < fraction)) if len(self.errors) else 0.0
 
+    def rough_within(self, fraction: float) -> tuple[float, ...]:
+        """For each disturbance, the percentage of the tests whose error is below a fraction."""
+        right = self.rough_errors < fraction
+        return tuple(100 * float(np.mean(column)) if len(column) else 0.0 for column in right.T)
+
     def of(self, tests: Collection[str]) -> "Prediction":
-        """The prediction restricted to some tests; the time remains the mean of all."""
+        """The prediction restricted to some tests; the time remains that of all."""
         rows = [row for row, name in enumerate(self.tests) if name in tests]
         return replace(
             self,
             tests=tuple(self.tests[row] for row in rows),
             errors=self.errors[rows],
             inliers=self.inliers[rows],
+            rough_errors=self.rough_errors[rows],
         )
 
     @property
@@ -73,6 +83,7 @@ class _Trial:
     error: float
     inliers: int
     seconds: float
+    rough: tuple[float, ...]
 
 
 class Trials:
@@ -81,13 +92,22 @@ class Trials:
     Args:
         map: The full map.
         left_out: The map without each of its images.
+        conditions: Which queries to predict.
         clock: Measures matching and pose, in seconds.
     """
 
-    def __init__(self, map: Map, left_out: LeftOut, *, clock: Callable[[], float] = perf_counter) -> None:
+    def __init__(
+        self,
+        map: Map,
+        left_out: LeftOut,
+        *,
+        conditions: Conditions = "rough",
+        clock: Callable[[], float] = perf_counter,
+    ) -> None:
         self._map = map
         self._left_out = left_out
         self._matching = map.descriptor_metric
+        self._disturbances = ROUGH if conditions == "rough" else ()
         self._clock = clock
         names = list(map.images)
         most = _MOST_TESTS if map.has_keypoints else 0  # a query has no descriptors
@@ -124,27 +144,50 @@ class Trials:
             tests=tuple(names),
             errors=np.array([one.error for one in found], np.float64),
             inliers=np.array([one.inliers for one in found], np.int64),
-            seconds=float(np.mean([one.seconds for one in found])) if found else 0.0,
+            seconds=float(np.median([one.seconds for one in found])) if found else 0.0,
+            rough_errors=np.array([one.rough for one in found], np.float64).reshape(
+                len(found), len(self._disturbances)
+            ),
         )
 
     def _try(self, name: str, targets: list[Target]) -> _Trial:
+        start = self._clock()
+        query = self._left_out.query(name)
+        matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
+        seconds = self._clock() - start
+        matched = self._matched(name, matches)
+        start = self._clock()
+        pose = matched.pose(matched.kept, matched.keypoints.pixels[matched.rows])
+        seconds += self._clock() - start
+        rough = [matched.disturbed_pose(one, self.tests.index(name)) for one in self._disturbances]
+        return _Trial(
+            error=self._error(name, pose),
+            inliers=pose.num_inliers if pose else 0,
+            seconds=seconds,
+            rough=tuple(self._error(name, one) for one in rough),
+        )
+
+    def _matched(self, name: str, matches: PointMatches) -> "_Matched":
         query, camera = self._left_out.query(name), self._map.camera(name)
         factor = self._map.shrink_factor(name)  # limits in pixels are for those in which features were found
         if factor > 1:
             camera = resized_camera(camera, 1 / factor)
-        start = self._clock()
-        matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
-        seconds = self._clock() - start
-        points2D = query.keypoints[matches.keypoints] / factor
+        keypoints = Keypoints(
+            pixels=query.keypoints / factor,
+            scales=None if query.scales is None else query.scales / factor,
+            size=(camera.width, camera.height),
+        )
         points3D = self._map.points3D_in_world[matches.points]
         true_pose = self._map.images[name].cam_from_world()
-        errors = reprojection_errors(points2D, points3D, true_pose, camera)
-        kept = handicap(errors, self.tests.index(name))
-        start = self._clock()
-        pose = estimate_pose(points2D[kept], points3D[kept], camera)
-        seconds += self._clock() - start
-        error, inliers = self._error(name, pose), pose.num_inliers if pose else 0
-        return _Trial(error=error, inliers=inliers, seconds=seconds)
+        errors = reprojection_errors(keypoints.pixels[matches.keypoints], points3D, true_pose, camera)
+        return _Matched(
+            keypoints=keypoints,
+            rows=matches.keypoints,
+            points3D=points3D,
+            wrong=errors > RansacOptions().max_error_px,
+            kept=handicap(errors, self.tests.index(name)),
+            camera=camera,
+        )
 
     def _error(self, name: str, pose: PoseEstimate | None) -> float:
         if pose is None:
@@ -170,6 +213,25 @@ class Trials:
         return reference_target(self._map, name)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Matched:
+    """A test with its matches, in pixels in which features were found."""
+
+    keypoints: Keypoints
+    rows: Ids
+    points3D: Points3D
+    wrong: Mask
+    kept: Mask
+    camera: pycolmap.Camera
+
+    def pose(self, used: Mask, pixels: Points2D) -> PoseEstimate | None:
+        return estimate_pose(pixels[used], self.points3D[used], self.camera)
+
+    def disturbed_pose(self, disturbance: Disturbance, test: int) -> PoseEstimate | None:
+        remain, pixels = disturbed(self.keypoints, self.rows, self.wrong, disturbance, test)
+        return self.pose(self.kept & remain, pixels)
+
+
 def handicap(errors_px: Float64[np.ndarray, " n"], test: int) -> Mask:
     """Decide which matches of a test are kept: those that a less similar query would have had as well.
 
@@ -177,6 +239,6 @@ def handicap(errors_px: Float64[np.ndarray, " n"], test: int) -> Mask:
         errors_px: Reprojection error of each match at the true pose. Wrong matches are always kept.
         test: Number of the test; it determines the share that is removed, and which matches.
     """
-    share = 1 - _LOST * (test * _GOLDEN % 1)
+    share = 1 - _LOST * (test * GOLDEN % 1)
     drawn = np.random.default_rng(test).random(len(errors_px)) < share
     return drawn | (errors_px > RansacOptions().max_error_px)

@@ -23,7 +23,8 @@ from slimsfm.reduction.choice import (
     check_reachable,
     points_seen,
 )
-from slimsfm.reduction.forecast import Trials
+from slimsfm.reduction.disturbance import Conditions, check_conditions
+from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.image_sets import DominatingSetOptions, dominating_set
 from slimsfm.selection import REPLACED_SELECTORS, SELECTORS, current_selector
 from slimsfm.selection.problem import SelectionProblem
@@ -58,10 +59,14 @@ class FrontierOptions:
     edges: Edges = "auto"
     """How the reference graph is computed, where images are kept; see `GraphOptions.edges`."""
 
+    conditions: Conditions = "rough"
+    """Queries to predict: only some as clean as the map's photos, or blurred and partly hidden ones too."""
+
     seed: int = 0
     """Seed of all random choices."""
 
     def __post_init__(self) -> None:
+        check_conditions(self.conditions)
         selectors = (*SELECTORS, *(name for name in REPLACED_SELECTORS if name in self.selectors))
         for name, known in (("uses", USES), ("selectors", selectors)):
             values = getattr(self, name)
@@ -116,17 +121,21 @@ def frontier(
     ]
     for use in options.uses:
         check_reachable(choices, sizes, use, limits)
-    return _predicted(Trials(map, left_out), choices, sizes, progress)
+    trials = Trials(map, left_out, conditions=options.conditions)
+    full, candidates = _predicted(trials, choices, sizes, progress)
+    return Frontier(full=full, candidates=candidates, bytes=weigh_map(map))
 
 
-def _predicted(trials: Trials, choices: list[Choice], sizes: list[int], progress: ProgressBar) -> Frontier:
+def _predicted(
+    trials: Trials, choices: list[Choice], sizes: list[int], progress: ProgressBar
+) -> tuple[Prediction, tuple[Candidate, ...]]:
     full = trials.full(trials.tests, progress)
     candidates = []
     for choice, size in zip(progress(choices, "predict losses"), sizes, strict=True):
         prediction = trials.images(choice.images) if choice.use == "images" else trials.points(choice.points)
         full_part = full.of(prediction.tests)
         candidates.append(Candidate(choice=choice, bytes=size, prediction=prediction, full=full_part))
-    return Frontier(full=full, candidates=tuple(candidates))
+    return full, tuple(candidates)
 
 
 def check_reducible(map: Map) -> None:
@@ -156,6 +165,7 @@ def forecast_images(
     *,
     method: str = "images",
     detail: str | None = None,
+    conditions: Conditions = "rough",
     progress: ProgressBar = silent,
 ) -> Candidate:
     """Predict the effect of keeping these images; the other images are the tests.
@@ -165,6 +175,7 @@ def forecast_images(
         names: The images to keep.
         method: How they were chosen.
         detail: The request to the method; None: the names.
+        conditions: Queries to predict.
         progress: Progress callback.
 
     Raises:
@@ -172,7 +183,7 @@ def forecast_images(
     """
     images = tuple(sorted(set(names)))
     slim = keep_images(map, images)
-    trials = Trials(map, LeftOut(map))
+    trials = Trials(map, LeftOut(map), conditions=conditions)
     choice = Choice(
         use="images",
         method=method,

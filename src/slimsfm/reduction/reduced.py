@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -16,6 +17,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images, with_points
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction.choice import DOMINATING, Candidate, ReductionLimits, apply_choice, recommend
+from slimsfm.reduction.disturbance import Conditions, check_conditions
 from slimsfm.reduction.image_sets import (
     Cost,
     DominatingSetOptions,
@@ -124,10 +126,15 @@ class ReduceOptions:
     image_choice: ImageOptions = ImageOptions()
     """How images are chosen."""
 
+    conditions: Conditions = "rough"
+    """Queries that losses are predicted for: only some as clean as the map's photos (clean), or blurred and
+    partly hidden ones too (rough), for which more points are kept where they need them."""
+
     seed: int = 0
     """Seed of all random choices."""
 
     def __post_init__(self) -> None:
+        check_conditions(self.conditions)
         if self.for_ is not None and self.for_ not in get_args(Use):
             raise ValueError(f"for_ must be one of {', '.join(get_args(Use))}, got {self.for_!r}")
         if self.selector is not None:
@@ -204,8 +211,9 @@ def reduce(
     """Make a map small, and predict what that costs.
 
     By default many selections of points are tried on the map's own images, each left out in turn, and the
-    smallest one that loses nothing is kept, with a reserve. A map that was built without a detector has no
-    points to match: a dominating set of its images is kept.
+    smallest one that loses nothing is kept, with a reserve that also holds for blurred and partly hidden
+    queries. A map that was built without a detector has no points to match: a dominating set of its images is
+    kept.
 
     Args:
         map: The full map.
@@ -230,7 +238,7 @@ def reduce(
         reduced = _with_images(reduced, options, graph, progress)
     left = tuple(use for use in options.uses if use not in reduced.forecast)
     if left:
-        tried = FrontierOptions(uses=left, seed=options.seed)
+        tried = FrontierOptions(uses=left, conditions=options.conditions, seed=options.seed)
         if options.selector:
             tried = replace(tried, selectors=(options.selector,))
         if options.limits.max_points:
@@ -260,20 +268,21 @@ def _with_images(
 ) -> Reduced:
     """Choose images as requested, and predict their effect."""
     full, wanted = reduced.map, options.image_choice
+    predict = partial(forecast_images, full, conditions=options.conditions, progress=progress)
     if wanted.images:
-        one = forecast_images(full, wanted.images, progress=progress)
+        one = predict(wanted.images)
         return replace(reduced, forecast={"images": one})
     if wanted.random is not None:
         names = tuple(keep_random_images(full, wanted.random, seed=options.seed).images)
         detail = f"{len(names)} images, seed {options.seed}"
-        one = forecast_images(full, names, method="random", detail=detail, progress=progress)
+        one = predict(names, method="random", detail=detail)
         return replace(reduced, forecast={"images": one})
     given = read_given_graph(wanted.graph, full) if wanted.graph is not None else graph
     found = find_graph(full, wanted.graph_options, given, progress)
     asked = wanted.set_options(seed=options.seed, max_images=options.limits.max_images)
     solution = dominating_set(found, asked, full)
     names = _within(full, found, solution, asked, options.limits)
-    one = forecast_images(full, names, method=DOMINATING, detail=_detail(wanted, asked), progress=progress)
+    one = predict(names, method=DOMINATING, detail=_detail(wanted, asked))
     return replace(reduced, forecast={"images": one}, graph=found, solution=solution)
 
 

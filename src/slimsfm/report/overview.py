@@ -93,7 +93,8 @@ def _tiles(data: ReportData, line: Comparison) -> str:
             "Matching and pose, per query",
             f"{_milliseconds(before)} → {_milliseconds(after)} ms",
             f"{format_ratio(line.faster, 'faster', 'slower')}; "
-            f"95 % interval of the ratio {faster.low:.1f} to {faster.high:.1f}",
+            f"95 % interval of the ratio {faster.low:.1f} to {faster.high:.1f}; "
+            f"{format_ratio(line.faster_whole, 'faster', 'slower')} with extraction",
         ),
         (
             "Accuracy, ADD-0.1d",

@@ -36,6 +36,9 @@ class LeftOutImage:
     descriptors: Descriptors
     """Unit descriptor of each keypoint."""
 
+    scales: Float64[np.ndarray, " n"] | None
+    """Scale of each keypoint in pixels; None if the map's extractor has no scales."""
+
 
 class LeftOut:
     """Describes points by their observations in all images but one, so that this one can be a query."""
@@ -48,7 +51,9 @@ class LeftOut:
     def _query(self, name: str) -> LeftOutImage:
         features = self._map.features[name]
         return LeftOutImage(
-            keypoints=features.keypoints.astype(np.float64), descriptors=unit_rows(features.descriptors)
+            keypoints=features.keypoints.astype(np.float64),
+            descriptors=unit_rows(features.descriptors),
+            scales=None if features.frames is None else features.frames[:, 0].astype(np.float64),
         )
 
     def describe(self, points: Ids, name: str) -> Float32[np.ndarray, "n d"]:
