@@ -1,4 +1,4 @@
-"""What happens to photos on their way to a localizer: zoomed, cropped, framed, mirrored, blurred, dark, hidden.
+"""What happens to photos before they are localized: zoomed, cropped, framed, mirrored, blurred, dark, hidden.
 
 Each disturbance is a pure function. It takes a photo with its true camera and pose and gives the changed
 photo, the true camera of that, and what its user believes the camera to be: one that is given, what EXIF
