@@ -156,7 +156,7 @@ def reliability_table(records: Sequence[Record]) -> list[str]:
 
 
 def bound_table(records: Sequence[Record]) -> list[str]:
-    """The share of true errors under their bounds in each scene: clean queries, right poses, all found poses."""
+    """The share of true errors under their bounds in each scene: clean, of right poses, and of found ones."""
     rows = []
     for scene in _distinct(one.scene for one in records):
         found = [one for one in records if one.scene == scene and one.found]
