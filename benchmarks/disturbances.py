@@ -18,7 +18,11 @@ from slimsfm.pose.types import with_focal_length
 from slimsfm.synthetic import texture
 
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))
-_PHOTONS, _READ_NOISE, _NIGHT = 60.0, 1.5, 0.3  # per white pixel, in electrons, and how bright white looks
+_PHOTONS, _READ_NOISE, _NIGHT = (
+    20.0,
+    2.0,
+    0.15,
+)  # electrons of a white pixel and of noise, and how bright white looks
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -219,7 +223,7 @@ ABSURD = np.inf
 
 DISTURBANCES: dict[str, Disturbance] = {
     "clean": Disturbance(group="clean", given=1.0),
-    "own": Disturbance(group="clean", pixels="file"),
+    "own": Disturbance(group="own", pixels="file"),
     "focal10": Disturbance(group="focal", given=1.1),
     "focal-10": Disturbance(group="focal", given=0.9),
     "focal30": Disturbance(group="focal", given=1.3),

@@ -107,7 +107,8 @@ def disturbed(scene: MappedScene, query: PosedQuery, name: str) -> DisturbedQuer
     path = query.path if disturbance.pixels == _FILE else kept.with_suffix(".jpg")
     if (focal_mm := film_focal_mm(disturbance, camera)) is not None:
         path = scene.folder / f"{name}-{query.path.stem}.jpg"
-        _write_photo(path, _changed(scene, query, disturbance).image, focal_mm)
+        if not path.exists():
+            _write_photo(path, _changed(scene, query, disturbance).image, focal_mm)
     return DisturbedQuery(
         scene=scene.name,
         disturbance=name,
@@ -172,11 +173,9 @@ def _changed(scene: MappedScene, query: PosedQuery, disturbance: Disturbance) ->
 
 
 def _write_photo(path: Path, image: Image, film_focal_mm: int | None) -> None:
-    """Write a JPEG file, with EXIF if there is a focal length to write, unless it exists."""
-    if path.exists():
-        return
+    """Write a JPEG file, with EXIF if there is a focal length to write."""
     exif = PilImage.Exif()
     if film_focal_mm is not None:
         exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = film_focal_mm
-    with replacing(path, overwrite=False) as partial:
+    with replacing(path, overwrite=True) as partial:
         PilImage.fromarray(image).save(partial, "JPEG", quality=_QUALITY, exif=exif)

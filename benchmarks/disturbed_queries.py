@@ -65,19 +65,26 @@ def main() -> None:
     parser.add_argument("--photos", required=True, type=Path, help="folder with plush, fox, lund and office")
     parser.add_argument("--scenes", nargs="+", default=NAMES, choices=NAMES)
     parser.add_argument("--queries", type=int, default=QUERIES, help="queries per scene")
+    parser.add_argument("--before", type=Path, help="records.json of an earlier version, to compare with")
     parser.add_argument(
         "--exhaustive", action="store_true", help="exhaustive matching with the full map, too"
     )
     arguments = parser.parse_args()
     scenes = [mapped_scene(name, arguments.photos, arguments.output) for name in arguments.scenes]
-    records = []
+    before = read_records(arguments.before) if arguments.before else []
+    records: list[Record] = []
     for scene in scenes:
         found = examples(scene, scenes, queries=arguments.queries)
         records += measured(scene, list(found), exhaustive=arguments.exhaustive)
         (arguments.output / "records.json").write_text(json.dumps([asdict(one) for one in records], indent=1))
-    table = report(records)
+    table = report(records, before)
     (arguments.output / "table.md").write_text(table)
     print(table)
+
+
+def read_records(path: Path) -> list[Record]:
+    """What an earlier version wrote."""
+    return [Record(**one) for one in json.loads(path.read_text())]
 
 
 def measured(scene: MappedScene, queries: Sequence[DisturbedQuery], *, exhaustive: bool) -> Iterator[Record]:

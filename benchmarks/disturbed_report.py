@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import attrgetter
 
 import numpy as np
 
@@ -11,6 +12,15 @@ from slimsfm.geometry import ADD_FRACTIONS
 
 FOUND = 0.5
 """Confidence from which a query counts as found, the default of `LocalizationOptions`."""
+
+LEAST_RIGHT, LEAST_FOUND = 0.95, 0.8
+"""Targets: share of right poses of those over `SURE`, and of found and right queries of `RECOVERED`."""
+
+RECOVERED = ("zoom", "crop", "frame", "exif")
+"""Groups in which the camera is wrong and can be found out."""
+
+MOST_STRANGE = {"mirrored": 0.01}
+"""Largest share of queries that are found though no pose is right, by disturbance; 0 for others."""
 
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 
@@ -71,12 +81,18 @@ class Record:
         return self.error < ADD_FRACTIONS[0]
 
 
-def report(records: Sequence[Record]) -> str:
-    """All tables: for each method all scenes together and each scene, then reliability."""
+def report(records: Sequence[Record], before: Sequence[Record] = ()) -> str:
+    """All tables: for each method all scenes together and each scene, then reliability.
+
+    Records of an earlier version are compared where it localized the same queries.
+    """
     lines: list[str] = []
     for method in _distinct(one.method for one in records):
         some = [one for one in records if one.method == method]
         lines += [f"## {method}", "", "### all scenes", "", *disturbance_table(some)]
+        lines += [*missed_targets(some), ""]
+        if before:
+            lines += ["### before and after", "", *comparison_table(before, some)]
         for scene in _distinct(one.scene for one in some):
             lines += [f"### {scene}", "", *disturbance_table([one for one in some if one.scene == scene])]
         lines += ["### reliability by group", "", *group_table(some)]
@@ -118,6 +134,38 @@ def disturbance_table(records: Sequence[Record]) -> list[str]:
             )
         )
     return _table(head, rows)
+
+
+def missed_targets(records: Sequence[Record]) -> list[str]:
+    """A line for each disturbance that misses a target."""
+    lines = []
+    for name in _distinct(one.disturbance for one in records):
+        some = [one for one in records if one.disturbance == name]
+        sure, found = [one for one in some if one.sure], [one for one in some if one.found]
+        if some[0].has_pose and sum(one.right for one in sure) < LEAST_RIGHT * len(sure):
+            lines.append(f"- {name}: fewer than {LEAST_RIGHT:.0%} of the poses over {SURE} are right")
+        if some[0].group in RECOVERED and sum(one.right for one in found) < LEAST_FOUND * len(some):
+            lines.append(f"- {name}: fewer than {LEAST_FOUND:.0%} of the queries are found and right")
+        if not some[0].has_pose and len(found) > MOST_STRANGE.get(name, 0) * len(some):
+            lines.append(f"- {name}: {len(found)} of {len(some)} queries without a right pose are found")
+    return lines
+
+
+def comparison_table(before: Sequence[Record], after: Sequence[Record]) -> list[str]:
+    """What became of the same queries: found, right of these, over `SURE` and wrong of these."""
+    key = attrgetter("scene", "method", "disturbance", "query")
+    common = {key(one) for one in before} & {key(one) for one in after}
+    rows = []
+    for name in _distinct(one.disturbance for one in after):
+        cells: list[str] = []
+        for records in (before, after):
+            some = [one for one in records if one.disturbance == name and key(one) in common]
+            found, sure = [one for one in some if one.found], [one for one in some if one.sure]
+            right, wrong = sum(one.right for one in found), sum(not one.right for one in sure)
+            cells += [f"{right} of {len(found)}", f"{wrong} of {len(sure)}"]
+        rows.append((name, *cells))
+    head = [f"{what} {when}" for when in ("before", "after") for what in ("right of found", "wrong of sure")]
+    return _table(("disturbance", *head), rows)
 
 
 def group_table(records: Sequence[Record]) -> list[str]:
