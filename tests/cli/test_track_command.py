@@ -172,7 +172,6 @@ def test_progress_is_plain_lines_without_a_terminal(boulder, video, tmp_path, ca
 
 def test_a_more_confident_pose_has_a_stronger_box(boulder, images):
     map_ = boulder.map
-    camera = map_.shared_camera
     (sure,) = [Tracker(Localizer(map_)).track(images[0])]
     changes = []
     for confidence in (1.0, 0.5, 0.01):

@@ -26,6 +26,9 @@ MIN_REFUTING = 2
 ACCURATE = 0.006
 """Predicted relative corner error up to which a pose is accurate."""
 
+SPREAD = 10
+"""Number of squares of the image in which inliers of an accurate pose must lie."""
+
 SETTLED = 0.8
 """Share of the previous round's predicted error above which further matches no longer help much."""
 
@@ -224,7 +227,10 @@ class _Shrunk(NamedTuple):
 
 
 def _suffices(rounds: list[RoundResult]) -> bool:
-    """Whether the last pose is sure, and accurate or not improving much."""
+    """Whether the last pose is sure, and not improving much, or accurate by inliers all over the object.
+
+    Inliers in one corner may agree with each other more exactly than with the rest, as repeated texture does.
+    """
     last = rounds[-1].evidence
     if last is None or last.confidence < SURE:
         return False
@@ -232,7 +238,7 @@ def _suffices(rounds: list[RoundResult]) -> bool:
         return False
     before = rounds[-2].evidence if len(rounds) > 1 else None
     settled = before is not None and last.predicted_error > SETTLED * before.predicted_error
-    return settled or last.predicted_error <= ACCURATE
+    return settled or (last.predicted_error <= ACCURATE and last.cells >= SPREAD)
 
 
 def _summed(rounds: list[RoundResult]) -> SearchResult:
