@@ -35,6 +35,11 @@ SETTLED = 0.8
 TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
 
+_INFLATION = (1.2, 2.5, 3.5)
+"""Factor of the standard deviations of a pose with no, one and two intrinsics estimated: errors of neighboring
+points are alike, which matters the more, the finer the differences that tell intrinsics from pose. Measured by
+`benchmarks/confidence.py`."""
+
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 
@@ -182,8 +187,11 @@ class Search:
             return None
         pose = pose if focal is None else replace(pose, estimated=(FOCAL_LENGTH,))
         if self._focal == "known":
-            return with_check(points2D, points3D, pose, shrunk.camera, self._ransac)
-        return fit_camera(points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal)
+            pose = with_check(points2D, points3D, pose, shrunk.camera, self._ransac)
+        else:
+            pose = fit_camera(points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal)
+        inflation = _INFLATION[min(len(pose.estimated), len(_INFLATION) - 1)]
+        return replace(pose, covariance=None if pose.covariance is None else inflation**2 * pose.covariance)
 
     def _prior(self, camera: pycolmap.Camera, source: CameraSource) -> FocalPrior | None:
         """What is expected of the focal length; None where it is known."""
