@@ -26,17 +26,25 @@ def test_a_black_image_has_no_pose_but_times(boulder):
 
 
 def test_a_map_with_several_cameras_needs_a_given_camera(two_cameras):
+    known = LocalizationOptions(strategy="exhaustive", focal="known")
     with pytest.raises(ValueError, match="camera must be given"):
-        Localizer(two_cameras, LocalizationOptions(strategy="exhaustive")).localize(BLACK)
+        Localizer(two_cameras, known).localize(BLACK)
 
 
-def test_a_given_camera_overrides_the_one_of_the_map(boulder):
+def test_a_wrong_camera_is_replaced_unless_the_user_insists_on_it(boulder):
     map_, path = boulder.map, boulder.mapping.image_paths[12]
     wrong = pycolmap.Camera(map_.shared_camera.todict())
     wrong.params = wrong.params * [1.3, 1.3, 1, 1]
     truth = map_.images[path.name].cam_from_world()
-    found = Localizer(map_).localize(read_image(path), wrong).pose.cam_from_world
-    assert corner_error(found, truth, map_.box) > 0.1
+    found = Localizer(map_).localize(read_image(path), wrong)
+    assert (found.camera_source, found.camera_estimated) == ("given", ("focal length",))
+    assert corner_error(found.pose.cam_from_world, truth, map_.box) < 0.03
+    assert found.camera.mean_focal_length() == pytest.approx(map_.shared_camera.mean_focal_length(), rel=0.02)
+    known = LocalizationOptions(focal="known", min_confidence=0.0)
+    kept = Localizer(map_, known).localize(read_image(path), wrong)
+    assert (kept.camera_estimated, kept.camera.params.tolist()) == ((), wrong.params.tolist())
+    assert corner_error(kept.pose.cam_from_world, truth, map_.box) > 0.1
+    assert kept.pose.confidence < found.pose.confidence
 
 
 @pytest.mark.parametrize("strategy", ["exhaustive", "direct"])
@@ -53,7 +61,8 @@ def test_descriptors_of_another_length_than_the_maps_are_an_error(exact, strateg
 @pytest.mark.parametrize("shape", [(640, 480, 3), (480, 480, 3)], ids=str)
 def test_the_camera_of_the_map_is_not_used_for_another_aspect_ratio(exact, shape):
     with pytest.raises(ValueError, match=f"image of {shape[1]}x{shape[0]}"):
-        Localizer(exact).localize(np.zeros(shape, np.uint8))
+        Localizer(exact, LocalizationOptions(focal="known")).localize(np.zeros(shape, np.uint8))
+    assert Localizer(exact).camera_of(np.zeros(shape, np.uint8)).source == "unknown"
 
 
 def test_a_camera_of_another_size_is_refused(exact):

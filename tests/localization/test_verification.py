@@ -11,7 +11,7 @@ from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
-from slimsfm.mapping.map import observed
+from slimsfm.mapping.map import GlobalDescriptors, observed
 from slimsfm.mapping.support import measure
 
 GOOD = Evidence(inliers=80, distinct=60, matched=100, predicted_error=0.004, rival=0, found=0.6)
@@ -106,7 +106,10 @@ def test_points_with_a_look_alike_far_away_are_not_distinct():
         for point in range(10):
             descriptors[by_point[point + 10]] = descriptors[by_point[point]]
         doubled[name] = replace(one, descriptors=descriptors)
-    described = describe_points(replace(plain, features=doubled))
+    one_word = GlobalDescriptors(
+        vocabulary=np.ones((1, 32), np.float32), descriptors=np.ones((len(plain.images), 32), np.float32)
+    )
+    described = describe_points(replace(plain, features=doubled, global_descriptors=one_word))
     apart = np.linalg.norm(plain.points3D_in_world[:10] - plain.points3D_in_world[10:20], axis=1)
     far = apart > 0.1 * plain.box.diagonal
     assert far.sum() > 5

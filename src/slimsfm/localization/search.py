@@ -36,9 +36,11 @@ TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
 
 _INFLATION = (1.2, 2.5, 3.5)
-"""Factor of the standard deviations of a pose with no, one and two intrinsics estimated: errors of neighboring
-points are alike, which matters the more, the finer the differences that tell intrinsics from pose. Measured by
-`benchmarks/confidence.py`."""
+"""Factor of the standard deviations of a pose with no, one, and two intrinsics estimated.
+
+Errors of neighboring points are alike, which matters the more, the finer the differences are that tell the
+intrinsics from the pose. Measured by `benchmarks/confidence.py`.
+"""
 
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
