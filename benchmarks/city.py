@@ -14,7 +14,8 @@ from jaxtyping import Float64, Int64, UInt8
 from slimsfm.arrays import IndexPairs
 from slimsfm.features import Features
 from slimsfm.geometry import Box
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.map import Map
 
 _REACH = 4.0  # meters of facade that an image sees to either side
 _DEPTH = 4.0  # meters from the camera to the facades, which vary by one meter

@@ -7,7 +7,8 @@ from scipy.spatial import KDTree
 
 from slimsfm.features import load_extractor
 from slimsfm.geometry import Box
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.map import Map
 from slimsfm.synthetic.scene import look_at
 
 WIDTH, HEIGHT = 320, 240

@@ -9,7 +9,8 @@ import pycolmap
 from slimsfm.features import Features
 from slimsfm.geometry import Box, project
 from slimsfm.graph import GraphOptions, ReferenceGraph, compute_graph
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.map import Map
 from slimsfm.synthetic.scene import look_at
 
 BOX = Box(np.zeros(3), np.diag([1.0, 0.8, 0.6]))

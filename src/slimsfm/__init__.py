@@ -45,7 +45,7 @@ if TYPE_CHECKING:
         frontier,
         reduce,
     )
-    from slimsfm.report.frames import track_video
+    from slimsfm.report.tracked_video import track_video
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 
 _MODULES = {
@@ -76,7 +76,7 @@ _MODULES = {
     "read_map": "slimsfm.mapping",
     "reduce": "slimsfm.reduction",
     "refine_pose": "slimsfm.pose",
-    "track_video": "slimsfm.report.frames",
+    "track_video": "slimsfm.report.tracked_video",
     "write_map": "slimsfm.mapping",
     "write_poses": "slimsfm.localization.pose_files",
 }

@@ -12,7 +12,7 @@ from commands import contents, slimsfm
 from slimsfm.cli import run
 from slimsfm.localization import Localizer
 from slimsfm.photos import read_image
-from slimsfm.report.frames import draw_tracked
+from slimsfm.report.tracked_video import draw_tracked
 from slimsfm.tracking import Tracker, TrackerOptions
 from slimsfm.tracking.video import open_frames, write_video
 

@@ -14,8 +14,9 @@ from slimsfm.localization.localizer import Localizer
 from slimsfm.localization.matching import ReferenceMatching
 from slimsfm.localization.strategy import Query, unite
 from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
+from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.io import read_map, write_map
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import exhaustive_pairs
 from slimsfm.mapping.subset import keep_images
 from slimsfm.methods.loftr.extractor import DetectorFree, DetectorFreeMatching

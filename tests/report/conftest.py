@@ -6,7 +6,8 @@ from runs import make_run
 from slimsfm.evaluation.results import Run
 from slimsfm.features import Features
 from slimsfm.geometry import Box
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.report import report_html
 

@@ -12,7 +12,7 @@ from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import counted, shown
-from slimsfm.report.frames import track_video
+from slimsfm.report.tracked_video import track_video
 from slimsfm.tracking import Tracked, TrackerOptions
 from slimsfm.tracking.video import FrameSource, VideoFrame, check_format
 

@@ -20,7 +20,7 @@ def view(
     images: Path | None = None,
     queries: Path | None = None,
     camera: Path | None = None,
-    focal: FocalLength = "known",
+    focal: FocalLength = "auto",
     networks: Annotated[Networks, Advanced()] = Networks(),
     port: int = 8080,
     host: str = "localhost",

@@ -2,8 +2,9 @@
 
 from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
+from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.io import read_map, write_map
-from slimsfm.mapping.map import Map, MapInfo, Observations
+from slimsfm.mapping.map import Map, Observations
 from slimsfm.mapping.subset import keep_images
 
 __all__ = [

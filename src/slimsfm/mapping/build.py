@@ -14,8 +14,9 @@ from slimsfm.geometry import Box
 from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import guess_cameras
+from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.keypoint_model import build_from_keypoints
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.map import Map
 from slimsfm.mapping.masked_photos import MaskedPhotos, find_photos
 from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.quality import ModelQuality

@@ -14,7 +14,8 @@ from slimsfm.features.store import stored_name
 from slimsfm.mapping.agreement import Masks, counted, place_features
 from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
-from slimsfm.mapping.map import Map, MapInfo
+from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.map import Map
 from slimsfm.mapping.model import camera_of, estimate_box, positions, read_box, read_model
 from slimsfm.mapping.pairs import Matches
 from slimsfm.mapping.quality import ModelQuality

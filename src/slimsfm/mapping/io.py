@@ -35,7 +35,8 @@ from slimsfm.mapping.descriptors import (
     write_global_descriptors,
     write_point_descriptors,
 )
-from slimsfm.mapping.map import Map, MapInfo, check_map, check_num_features
+from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.map import Map, check_map, check_num_features
 from slimsfm.mapping.model import read_model
 from slimsfm.mapping.quality import quality_from_json
 from slimsfm.photos import Orientation, shrink

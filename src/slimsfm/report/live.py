@@ -51,7 +51,7 @@ class LiveQueries:
     camera: pycolmap.Camera | None = None
     """Intrinsics of the images; None: those of the map or of EXIF."""
 
-    focal: FocalLength = "known"
+    focal: FocalLength = "auto"
     """How well the focal length is known."""
 
     @cached_property

@@ -1,0 +1,49 @@
+"""What a map says of itself: how it was made, its box and unit, and the photos that it is of."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from slimsfm.devices import Device
+from slimsfm.geometry import Box
+from slimsfm.mapping.quality import ModelQuality
+from slimsfm.photos import Orientation
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapInfo:
+    """Metadata of a map, stored in its `map.json`."""
+
+    extractor: str
+    """Name of the extractor of the map's features and of the queries'."""
+
+    extractor_options: dict = field(default_factory=dict)
+    """Options of the extractor."""
+
+    box: Box
+    """The object's box in the map's frame."""
+
+    box_source: str
+    """Source of the box: "given" or "estimated"."""
+
+    unit: str = "unknown"
+    """Unit of the map's frame: "metre", or "unknown" if SfM left the scale open."""
+
+    origin: str
+    """A sentence that says how the map was made."""
+
+    quality: ModelQuality | None = None
+    """What supports the full model, and what contradicts it. None without verified matches."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences, with names, on what was skipped, ignored or guessed when the map was made."""
+
+    orientation: Orientation = "upright"
+    """Which pixels of the image files model, features and poses are of. Queries are read alike."""
+
+    exif_orientations: Mapping[str, int] = field(default_factory=dict)
+    """EXIF orientation of the images of an upright map, by name, where it is not 1. Empty in maps of version
+    0.1, which did not record it."""
+
+    devices: Mapping[int, Device] = field(default_factory=dict)
+    """What EXIF says of the photos that a camera was made with, by its id, where they agree. Empty in older
+    maps and in maps made without the photos."""
