@@ -19,10 +19,7 @@ from slimsfm.localization import (
     localize_images,
     localize_objects,
 )
-from slimsfm.localization.cameras import (
-    read_camera,
-    read_gravity,
-)
+from slimsfm.localization.cameras import read_camera, read_gravity
 from slimsfm.localization.pose_files import check_names_for, write_object_poses, write_poses, writer_for
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import shown
@@ -63,23 +60,19 @@ def localize(
     networks.apply()
     check_output(output, map, images, *also, full, camera, gravity, overwrite=overwrite)
     writer_for(output, several=bool(also))
-    if workers is not None and workers < 1:
-        raise InputError(f"workers must be at least 1, got {workers}")
-    for name, value in (("gravity", gravity), ("full", full)):
-        if value and also:
-            raise InputError(f"{name} goes with one map; leave out also or {name}")
+    _check_options(workers, also, gravity=gravity, full=full)
     localizers = {name: Localizer(read_map(path), localization) for name, path in _named(map, *also).items()}
     check_names_for(output, [images.name] if images.is_file() else find_images(images).names)
-    given = read_camera(camera) if camera else None
+    camera_of_all = read_camera(camera) if camera else None
+    shared = {"camera": camera_of_all, "workers": workers, "progress": shown}
     again: dict[str, Localization] = {}
-    shared = {"camera": given, "workers": workers, "progress": shown}
     if also:
         by_object = localize_objects(MultiLocalizer(localizers), images, **shared)
         write_object_poses(output, by_object, overwrite=overwrite)
     else:
         ((name, only),) = localizers.items()
         shared["gravity"] = read_gravity(gravity) if gravity else None
-        fallback = _full_map(full, only, localization) if full else None
+        fallback = _full_map(full, only) if full else None
         results = localize_images(only, images, **shared)
         again = localize_failed(fallback, results, images, **shared) if fallback else {}
         by_object = {name: {**results, **again}}
@@ -91,6 +84,14 @@ def localize(
     finish(f"{output}: {found} of {plural(len(next(iter(by_object.values()))), 'image')} localized", watch)
 
 
+def _check_options(workers: int | None, also: Collection[Path], **of_one_map: Path | None) -> None:
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1, got {workers}")
+    for name, value in of_one_map.items():
+        if value and also:
+            raise InputError(f"{name} goes with one map; leave out also or {name}")
+
+
 def _named(*paths: Path) -> dict[str, Path]:
     """Map paths by their last part, or by the whole path where these parts are equal."""
     last = [path.resolve().name for path in paths]
@@ -100,11 +101,11 @@ def _named(*paths: Path) -> dict[str, Path]:
     return dict(zip(names, paths, strict=True))
 
 
-def _full_map(path: Path, reduced: Localizer, options: LocalizationOptions) -> Localizer:
+def _full_map(path: Path, reduced: Localizer) -> Localizer:
     """The localizer of the full map that a map was reduced from."""
     found = read_map(path)
     check_same_frame(reduced.map, found)
-    return Localizer(found, options)
+    return Localizer(found, reduced.options)
 
 
 def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collection[str]) -> int:

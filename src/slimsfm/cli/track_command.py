@@ -38,8 +38,8 @@ def track(
         source: A video file, a folder of images, or a camera by its index, such as 0, until Ctrl-C.
         output: Poses as .json, .csv, .txt (TUM) or images.txt (COLMAP).
         video: Write the video with the object's box. The fainter the box, the less sure the pose.
-        camera: Intrinsics of the frames in COLMAP's cameras.txt format. Without it, those of the map or from
-            EXIF are used.
+        camera: Intrinsics of the frames in COLMAP's cameras.txt format. Without it, those of the map where
+            size and EXIF fit, else from EXIF; else the focal length is estimated with the first pose.
         tracker: How to track.
         localization: How to localize.
         networks: Where learned methods run.

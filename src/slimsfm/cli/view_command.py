@@ -32,8 +32,9 @@ def view(
         reduced: A map that was reduced from it, to switch between the two.
         images: Folder of the map's photos, to show them in their cameras.
         queries: Folder of images to localize.
-        camera: Intrinsics of the queries in COLMAP's cameras.txt format; default: the map's or EXIF's.
-        focal: How well the queries' focal length is known.
+        camera: Intrinsics of the queries in COLMAP's cameras.txt format. Without it, those of the map where
+            size and EXIF fit, else from EXIF; else the focal length is estimated.
+        focal: How far the queries' focal length is believed, as in localize.
         networks: Where learned methods run.
         port: Port of the view; 0 picks a free one.
         host: Address of the view: localhost serves this machine only, 0.0.0.0 the whole network.

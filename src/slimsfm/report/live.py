@@ -49,10 +49,10 @@ class LiveQueries:
     """Folder of images."""
 
     camera: pycolmap.Camera | None = None
-    """Intrinsics of the images; None: those of the map or of EXIF."""
+    """Intrinsics of the images; chosen by `query_camera` if not given."""
 
     focal: FocalLength = "auto"
-    """How well the focal length is known."""
+    """How far the focal length is believed, see `LocalizationOptions.focal`."""
 
     @cached_property
     def names(self) -> list[str]:
@@ -207,7 +207,7 @@ class LiveView:
             shown: Key of the map.
 
         Raises:
-            SlimsfmError: The image cannot be read, or its focal length is unknown.
+            SlimsfmError: The image cannot be read, or its focal length must be known but is not.
         """
         assert self.queries is not None
         options = LocalizationOptions(focal=self.queries.focal)

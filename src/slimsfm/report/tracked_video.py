@@ -52,10 +52,11 @@ def track_video(
     what was tracked is returned.
 
     Args:
-        localizer: Localizer of the map. It must assume a known focal length.
+        localizer: Localizer of the map.
         source: A video file, a folder of images, or a camera by its index.
         options: How to track.
-        camera: Intrinsics of the frames; if not given, those of the map or from EXIF.
+        camera: Intrinsics of the frames, chosen as by `query_camera` if not given. What is estimated with the
+            first pose is kept.
         video: Where to write the video with the object's box. The fainter the box, the less sure the pose.
         overwrite: Whether to replace an existing `video`.
         progress: Progress callback.
@@ -64,8 +65,8 @@ def track_video(
         The outcome of each frame.
 
     Raises:
-        InputError: The source cannot be read or has no frame, its focal length is unknown, or the images of
-            a folder differ in size.
+        InputError: The source cannot be read or has no frame, its focal length must be known but is not, or
+            the images of a folder differ in size.
         OutputError: The video cannot be written.
     """
     source, tracker = str(source), Tracker(localizer, options)

@@ -162,7 +162,7 @@ class Tracker:
         """The intrinsics of a frame: those that were estimated for a frame of its size, else as usual."""
         known = self._estimated
         if known and (known.width, known.height) == image.shape[1::-1]:
-            return QueryCamera(camera=known, source="given")
+            return QueryCamera(camera=known, source="queries")
         return self._localizer.camera_of(image, camera)
 
     def _followed(self, frame: GrayFrame) -> Track | None:
