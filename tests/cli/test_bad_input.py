@@ -306,7 +306,8 @@ def test_a_bad_camera_file(refused, boulder, tmp_path):
     refused(*images, "--camera", camera, naming="320x240")
 
 
-def test_an_image_of_unknown_focal_length(refused, boulder, tmp_path):
+def test_an_image_whose_focal_length_must_be_known_but_is_not(refused, boulder, tmp_path):
     upright = tmp_path / "upright.png"
     Image.new("RGB", (240, 320)).save(upright)
-    refused("localize", boulder.map_path, upright, "-o", tmp_path / "poses.json", naming="--camera FILE")
+    arguments = ("localize", boulder.map_path, upright, "-o", tmp_path / "poses.json", "--focal", "known")
+    refused(*arguments, naming="--camera FILE")

@@ -191,6 +191,9 @@ def test_a_pose_says_how_sure_and_exact_it_is(boulder, tmp_path):
         assert 0.5 <= row["confidence"] <= 1
         assert 0 < row["predicted_corner_error"] < 0.1
         assert np.array(row["covariance"]).shape == (6, 6)
+        assert 0 < row["position_bound_95"] < boulder.map.box.diagonal
+        assert 0 < row["rotation_bound_95_deg"] < 10
+        assert (row["camera_source"], row["camera_estimated"]) == ("map", [])
         assert row["focal_length_px"] == pytest.approx(boulder.map.shared_camera.mean_focal_length())
 
 

@@ -100,7 +100,6 @@ def test_the_chosen_query_is_shown(poster, queries):
     ("name", "why"),
     [
         ("noise.png", "not localized"),
-        ("narrow.png", "its focal length is unknown"),
         ("words.png", "not a readable image"),
     ],
 )
@@ -125,11 +124,14 @@ def test_a_query_that_is_not_localized_again_loses_its_frustum(poster, queries, 
         wait_until(lambda: browser.scene.get_handle_by_name("/queries/one.png") is None)
 
 
-def test_an_unknown_focal_length_is_optional(poster, queries):
-    with opened(poster, None, queries, focal="unknown") as view, browsing(view) as browser:
+@pytest.mark.parametrize(
+    ("options", "why"), [({}, "not localized"), ({"focal": "known"}, "its focal length is unknown")]
+)
+def test_an_unknown_focal_length_is_refused_only_on_request(poster, queries, options, why):
+    with opened(poster, None, queries, **options) as view, browsing(view) as browser:
         browser.choose(browser.queries.names, "narrow.png")
         browser.press(browser.queries.button)
-        wait_until(lambda: "not localized" in browser.queries.message.content)
+        wait_until(lambda: why in browser.queries.message.content)
         wait_until(lambda: not browser.queries.button.disabled)
 
 

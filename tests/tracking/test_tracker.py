@@ -9,6 +9,7 @@ import pytest
 
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localizer
+from slimsfm.pose.types import with_focal_length
 from slimsfm.tracking import Tracker, TrackerOptions
 
 BLACK = np.zeros((240, 320, 3), np.uint8)
@@ -60,6 +61,19 @@ def test_results_say_which_pixels_they_are_of(localizer, walk):
     stored = Localizer(replace(localizer.map, info=info), localizer.options)
     for one in tracked(stored, [walk.images[0], walk.images[1], BLACK]):
         assert one.localization.orientation == "stored"
+
+
+def test_a_wrong_focal_length_is_corrected_with_the_first_pose_and_kept(localizer, walk):
+    right = localizer.map.shared_camera
+    wrong = with_focal_length(right, 1.3 * right.mean_focal_length())
+    tracker, images = Tracker(localizer, BUSY), walk.images[:8]
+    first, *others = [tracker.track(image, wrong).localization for image in images]
+    assert (first.camera_source, first.camera_estimated) == ("given", ("focal length",))
+    assert first.camera.mean_focal_length() == pytest.approx(right.mean_focal_length(), rel=0.05)
+    for one, truth in zip([first, *others], walk.cam_from_world, strict=False):
+        assert corner_error(one.pose.cam_from_world, truth, localizer.map.box) < 0.05
+        assert one.camera.params.tolist() == first.camera.params.tolist()
+    assert {one.camera_source for one in others} == {"queries"}
 
 
 def test_poses_do_not_depend_on_the_duration_of_background_work(localizer, walk, walked, monkeypatch):
