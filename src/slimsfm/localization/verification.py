@@ -33,7 +33,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import misfit
 
-EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
+EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1, 0.0, 0.0, 0.0, 0.0])
 """Weights of `Evidence.terms`, learned by `benchmarks/confidence.py`."""
 
 RIVAL_RANSAC = RansacOptions(min_inliers=6, max_iterations=150)
@@ -108,6 +108,10 @@ class Evidence:
                 -np.log(max(self.rival, 6) / 6),
                 -min(self.rival / self.inliers, 1.0),
                 self.found,
+                -np.log(np.clip(self.predicted_error, 0.04, 1.0) / 0.04),
+                -np.log(np.clip(self.uncalibrated_error, 0.02, 1.0) / 0.1),
+                -min(self.misfit, 1.0),
+                np.log(np.clip(self.cells, 1, 30) / 10),
             ]
         )
 
