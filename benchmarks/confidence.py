@@ -88,8 +88,8 @@ def example_of(
     """The pose of a query, if there is one."""
     camera = query_camera(localizer.map, query.path, query.believed)
     result = localizer.search(query.features, camera).best
-    if result.pose is None or result.evidence is None:
-        return
+    if result.pose is None or result.evidence is None or result.evidence.is_behind:
+        return  # a pose behind the surface is not believed whatever its other evidence
     error = np.inf
     if query.cam_from_world is not None:
         error = corner_error(result.pose.cam_from_world, query.cam_from_world, scene.full.box)
