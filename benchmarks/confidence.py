@@ -3,10 +3,10 @@
     python benchmarks/confidence.py -o /tmp/disturbed --photos ../shared/data
 
 The queries of every scene are disturbed in every way of `disturbances.py`, and queries of another scene,
-whose poses are all wrong, come as well. They are localized as a user would, in the full map by `progressive` and
-`retrieval`, and in the reduced map by `direct`; each pose is an example. The final weights are learned from
-all scenes. The reliability of a scene uses weights learned from all other scenes. Ends with how far the
-errors lie under their 95 % bounds, by the number of intrinsics that were estimated.
+whose poses are all wrong, come as well. They are localized as a user would, in the full map by
+`progressive` and `retrieval`, and in the reduced map by `direct`; each pose is an example. The final
+weights are learned from all scenes. The reliability of a scene uses weights learned from all other scenes.
+Ends with how far the errors lie under their 95 % bounds, by the number of intrinsics that were estimated.
 
 What was measured of a scene is stored in the output folder, and read from there the next time.
 """
