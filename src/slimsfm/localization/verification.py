@@ -77,13 +77,13 @@ class Evidence:
     found: float
     """Share of the points that should be visible that are found where they project and nowhere else."""
 
-    uncalibrated_error: float = 0.0
+    uncalibrated_error: float
     """Predicted relative corner error if nothing but the matches said what the intrinsics are."""
 
-    misfit: float = 0.0
+    misfit: float
     """How much the matches contradict the intrinsics: 1 is where more of them would have been estimated."""
 
-    cells: int = 0
+    cells: int
     """Number of squares, a sixteenth of the longer side wide, with keypoints that agree with the pose."""
 
     facing: float = 1.0
