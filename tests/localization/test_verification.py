@@ -9,7 +9,9 @@ from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
+from slimsfm.localization.search import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
+from slimsfm.localization.strategy import PointMatches
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import GlobalDescriptors, observed
 from slimsfm.mapping.support import measure
@@ -83,6 +85,27 @@ def test_a_pose_that_sees_the_surface_from_behind_is_not_believed():
         assert last.evidence.inliers > 50
         assert last.evidence.is_behind == is_behind
         assert (last.pose.confidence < 0.05) == is_behind
+
+
+def test_a_search_does_not_stop_with_accurate_inliers_in_one_corner():
+    def round_with(evidence):
+        nothing = PointMatches.none()
+        return RoundResult(
+            matches=nothing,
+            pose=None,
+            camera=camera(),
+            evidence=evidence,
+            match_seconds=0.0,
+            pose_seconds=0.0,
+        )
+
+    sure = replace(GOOD, inliers=400, distinct=390, matched=410, predicted_error=0.001)
+    assert sure.confidence > 0.95
+    corner = replace(sure, cells=4, inliers=400)
+    assert suffices([round_with(sure)])
+    assert not suffices([round_with(corner)])
+    assert not suffices([round_with(None)])
+    assert not suffices([round_with(replace(sure, predicted_error=0.02))])
 
 
 def test_next_to_contradicted_images_the_confidence_is_lower_and_elsewhere_it_is_not(exact):

@@ -108,7 +108,7 @@ class Search:
         rounds: list[RoundResult] = []
         for one in self.rounds(query, camera, gravity):
             rounds.append(one)
-            if _suffices(rounds):
+            if suffices(rounds):
                 return _summed(rounds)
         if rounds and self._focal == "auto" and camera.source in TRUSTED:
             rounds.append(self._with_any_focal_length(query, rounds[-1], camera))
@@ -236,7 +236,7 @@ class _Shrunk(NamedTuple):
         return enlarged
 
 
-def _suffices(rounds: list[RoundResult]) -> bool:
+def suffices(rounds: list[RoundResult]) -> bool:
     """Whether the last pose is sure, and not improving much, or accurate by inliers all over the object.
 
     Inliers in one corner may agree with each other more exactly than with the rest, as repeated texture does.

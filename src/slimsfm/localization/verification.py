@@ -102,7 +102,7 @@ class Evidence:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the camera is behind the surface that it sees, as that of a mirrored photo of a plane is."""
+        """Whether the pose sees the surface from behind, as that of a mirrored photo of a plane does."""
         return self.facing < _LEAST_FACING
 
     @property
