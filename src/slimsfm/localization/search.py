@@ -23,7 +23,7 @@ SURE = 0.95
 MIN_REFUTING = 2
 """Number of images that could have contradicted an ambiguous pose, before the search may stop."""
 
-ACCURATE = 0.006
+ACCURATE = 0.007
 """Predicted relative corner error up to which a pose is accurate."""
 
 SPREAD = 10
@@ -110,7 +110,8 @@ class Search:
             rounds.append(one)
             if suffices(rounds):
                 return _summed(rounds)
-        if rounds and self._focal == "auto" and camera.source in TRUSTED:
+        is_sure = rounds and rounds[-1].confidence >= SURE
+        if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
             rounds.append(self._with_any_focal_length(query, rounds[-1], camera))
         return _summed(rounds)
 
