@@ -4,7 +4,7 @@
 
 The queries of every scene are disturbed in every way of `disturbances.py`, and queries of another scene,
 whose poses are all wrong, come as well. They are localized as a user would, in the full map by
-`progressive` and `retrieval`, and in the reduced map by `direct`; each pose is an example. The final
+`progressive`, and in the reduced map by `direct`; each pose is an example. The final
 weights are learned from all scenes. The reliability of a scene uses weights learned from all other scenes.
 Ends with how far the errors lie under their 95 % bounds, by the number of intrinsics that were estimated.
 
@@ -25,7 +25,6 @@ from disturbed_scenes import NAMES, MappedScene, mapped_scene
 from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import query_camera
-from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.progress import shown
 
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.99, 1.0)
@@ -54,28 +53,25 @@ def main() -> None:
     parser.add_argument("-o", "--output", required=True, type=Path)
     parser.add_argument("--photos", required=True, type=Path, help="folder with plush, fox, lund and office")
     parser.add_argument("--scenes", nargs="+", default=NAMES, choices=NAMES)
+    parser.add_argument("--every", type=int, default=2, help="2: every second disturbed query")
     arguments = parser.parse_args()
     scenes = [mapped_scene(name, arguments.photos, arguments.output) for name in arguments.scenes]
     found: list[Example] = []
     for scene in scenes:
         path = arguments.output / f"confidence-{scene.name}.npz"
         if not path.exists():
-            write_examples(path, list(examples_of(scene, scenes)))
+            write_examples(path, list(examples_of(scene, scenes, arguments.every)))
         found += read_examples(path)
     report(found)
 
 
-def examples_of(scene: MappedScene, scenes: Sequence[MappedScene]) -> Iterator[Example]:
+def examples_of(scene: MappedScene, scenes: Sequence[MappedScene], every: int) -> Iterator[Example]:
     """The poses of all queries with all methods."""
     methods = {
         "progressive, full": (scene.full, LocalizationOptions(strategy="progressive")),
-        "retrieval, full": (
-            scene.full,
-            LocalizationOptions(strategy="retrieval", matching=MatchingOptions(retrieved=3)),
-        ),
         "direct, slim": (scene.slim, LocalizationOptions(strategy="direct")),
     }
-    queries = list(examples(scene, scenes))
+    queries = list(examples(scene, scenes))[::every]
     for method, (map_, options) in methods.items():
         localizer = Localizer(map_, options)
         for query in shown(queries, f"{scene.name} ({method})"):
