@@ -1,124 +1,121 @@
 """Learn the weights of the confidence of a pose, and measure how well the confidence agrees with the truth.
 
-    python benchmarks/confidence.py PHOTOS [PHOTOS ...] -o /tmp/scenes
+    python benchmarks/confidence.py -o /tmp/disturbed --photos ../shared/data
 
-Every strategy localizes every query of every scene, with all keypoints and with random subsets of them, and
-also queries of another scene, whose poses are all wrong. Each round of each strategy gives one example. The
-final weights are learned from all scenes. The reliability of a scene uses weights learned from all other
-scenes.
+The queries of every scene are disturbed in every way of `disturbances.py`, and queries of another scene,
+whose poses are all wrong, come as well. They are localized as a user would, in the full map by
+`progressive`, and in the reduced map by `direct`; each pose is an example. The final
+weights are learned from all scenes. The reliability of a scene uses weights learned from all other scenes.
+Ends with how far the errors lie under their 95 % bounds, by the number of intrinsics that were estimated.
+
+What was measured of a scene is stored in the output folder, and read from there the next time.
 """
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 
-from benchmark_scenes import Scene, scenes
-from deceptive_scenes import deceptions
-from slimsfm.evaluation.results import PreparedQuery
+from disturbed_examples import DisturbedQuery, examples
+from disturbed_scenes import NAMES, MappedScene, mapped_scene
 from slimsfm.geometry import ADD_FRACTIONS, corner_error
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.point_descriptors import describe_points
-from slimsfm.localization.strategy import MatchingOptions
-from slimsfm.mapping.subset import direct_map
-from slimsfm.synthetic.objects import OBJECTS
+from slimsfm.localization.cameras import query_camera
+from slimsfm.progress import shown
 
-KEPT = (1.0, 0.25, 0.08)  # shares of the keypoints of a query
-SLIM = 400  # points of a reduced map, drawn at random
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.99, 1.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Example:
+class Example(NamedTuple):
     """One pose."""
 
     scene: str
-    kind: str
+    method: str
+    group: str
     terms: np.ndarray
-    right: bool
+    error: float
+    bound: float
+    num_estimated: int
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the pose is right."""
+        return self.error < ADD_FRACTIONS[0]
 
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folders", nargs="*", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("-o", "--output", required=True, type=Path)
-    parser.add_argument("--objects", nargs="*", default=sorted(OBJECTS))
+    parser.add_argument("--photos", required=True, type=Path, help="folder with plush, fox, lund and office")
+    parser.add_argument("--scenes", nargs="+", default=NAMES, choices=NAMES)
+    parser.add_argument("--every", type=int, default=2, help="2: every second disturbed query")
     arguments = parser.parse_args()
-    known = list(scenes(arguments.folders, arguments.objects, arguments.output))
-    known += list(deceptions(arguments.output))
-    examples = []
-    for scene, other in zip(known, [*known[1:], known[0]], strict=True):
-        found = list(examples_of(scene, other))
-        examples += found
-        print(
-            f"{scene.name}: {len(found)} poses, {np.mean([one.right for one in found]):.0%} right", flush=True
-        )
-    np.savez(
-        arguments.output / "confidence.npz",
-        terms=[one.terms for one in examples],
-        right=[one.right for one in examples],
-        scene=[one.scene for one in examples],
-        kind=[one.kind for one in examples],
-    )
-    report(examples)
+    scenes = [mapped_scene(name, arguments.photos, arguments.output) for name in arguments.scenes]
+    found: list[Example] = []
+    for scene in scenes:
+        path = arguments.output / f"confidence-{scene.name}.npz"
+        if not path.exists():
+            write_examples(path, list(examples_of(scene, scenes, arguments.every)))
+        found += read_examples(path)
+    report(found)
 
 
-def examples_of(scene: Scene, other: Scene) -> Iterator[Example]:
-    """The poses of all rounds of all strategies."""
-    full = scene.references
-    described = describe_points(full)
-    drawn = np.sort(np.random.default_rng(0).permutation(len(described.points))[:SLIM])
-    makers = {
-        "progressive": (full, LocalizationOptions(strategy="progressive")),
-        "retrieval": (full, LocalizationOptions(strategy="retrieval", matching=MatchingOptions(retrieved=3))),
-        "direct": (full, LocalizationOptions(strategy="direct")),
-        "slim": (direct_map(full, described[drawn]), LocalizationOptions(strategy="direct")),
+def examples_of(scene: MappedScene, scenes: Sequence[MappedScene], every: int) -> Iterator[Example]:
+    """The poses of all queries with all methods."""
+    methods = {
+        "progressive, full": (scene.full, LocalizationOptions(strategy="progressive")),
+        "direct, slim": (scene.slim, LocalizationOptions(strategy="direct")),
     }
-    for kind, (map_, options) in makers.items():
+    queries = list(examples(scene, scenes))[::every]
+    for method, (map_, options) in methods.items():
         localizer = Localizer(map_, options)
-        for number, prepared in enumerate(scene.queries):
-            share = KEPT[number % len(KEPT)] if kind in ("progressive", "direct") else 1.0
-            yield from poses(scene, kind, localizer, thinned(prepared, share), strange=False)
-            if share < 1 and number % 2:
-                yield from poses(scene, kind, localizer, prepared, strange=False)
-        for prepared in other.queries[::4]:
-            yield from poses(scene, f"{kind}, other scene", localizer, prepared, strange=True)
+        for query in shown(queries, f"{scene.name} ({method})"):
+            yield from example_of(scene, method, localizer, query)
 
 
-def thinned(prepared: PreparedQuery, share: float) -> PreparedQuery:
-    """The query with a random subset of its keypoints."""
-    count = len(prepared.features)
-    kept = np.sort(np.random.default_rng(count).permutation(count)[: max(1, round(share * count))])
-    return replace(prepared, features=prepared.features[kept])
-
-
-def poses(
-    scene: Scene, kind: str, localizer: Localizer, prepared: PreparedQuery, *, strange: bool
+def example_of(
+    scene: MappedScene, method: str, localizer: Localizer, query: DisturbedQuery
 ) -> Iterator[Example]:
-    """The poses of all rounds."""
-    for attempt in localizer.rounds(prepared.features, prepared.query.camera):
-        if attempt.pose is None or attempt.evidence is None:
-            continue
-        truth = prepared.query.cam_from_world
-        error = corner_error(attempt.pose.cam_from_world, truth, scene.references.box)
-        yield Example(
-            scene=scene.name,
-            kind=kind,
-            terms=attempt.evidence.terms,
-            right=not strange and error < ADD_FRACTIONS[0],
-        )
+    """The pose of a query, if there is one."""
+    camera = query_camera(localizer.map, query.path, query.believed)
+    result = localizer.search(query.features, camera).best
+    if result.pose is None or result.evidence is None or result.evidence.is_behind:
+        return  # a pose behind the surface is not believed whatever its other evidence
+    error = np.inf
+    if query.cam_from_world is not None:
+        error = corner_error(result.pose.cam_from_world, query.cam_from_world, scene.full.box)
+    yield Example(
+        scene=scene.name,
+        method=method,
+        group=query.disturbance,
+        terms=result.evidence.terms,
+        error=error,
+        bound=result.pose.corner_bound(scene.full.box),
+        num_estimated=len(result.pose.estimated),
+    )
 
 
-def learn(examples: Sequence[Example]) -> np.ndarray:
+def write_examples(path: Path, found: Sequence[Example]) -> None:
+    """Store the examples of a scene."""
+    np.savez(path, **{name: [getattr(one, name) for one in found] for name in Example._fields})
+
+
+def read_examples(path: Path) -> list[Example]:
+    """Read what `write_examples` stored."""
+    columns = np.load(path)
+    return [Example(*row) for row in zip(*(columns[name] for name in Example._fields), strict=True)]
+
+
+def learn(found: Sequence[Example]) -> np.ndarray:
     """Logistic regression with equal weights for all scenes; only the constant may be negative."""
-    terms = np.array([one.terms for one in examples])
-    signs = np.array([1.0 if one.right else -1.0 for one in examples])
-    names = [one.scene for one in examples]
+    terms = np.array([one.terms for one in found])
+    signs = np.array([1.0 if one.is_right else -1.0 for one in found])
+    names = [one.scene for one in found]
     weights = np.array([1 / names.count(one) for one in names])
 
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
@@ -132,31 +129,72 @@ def learn(examples: Sequence[Example]) -> np.ndarray:
     return minimize(loss, np.zeros(terms.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
 
 
-def report(examples: list[Example]) -> None:
-    """Print reliability by confidence, and the weights."""
-    probabilities = np.empty(len(examples))
-    scene_of = np.array([one.scene for one in examples])
-    right = np.array([one.right for one in examples])
-    terms = np.array([one.terms for one in examples])
+def left_out_confidences(found: Sequence[Example]) -> np.ndarray:
+    """The confidence of each example by weights that are learned from the other scenes."""
+    confidences = np.empty(len(found))
+    scene_of = np.array([one.scene for one in found])
+    terms = np.array([one.terms for one in found])
     for name in dict.fromkeys(scene_of):
-        weights = learn([one for one in examples if one.scene != name])
+        weights = learn([one for one in found if one.scene != name])
         here = scene_of == name
-        probabilities[here] = 1 / (1 + np.exp(-np.clip(terms[here] @ weights, -50, 50)))
-        sure = here & (probabilities > 0.9)
-        print(
-            f"{name:16} over 0.9: {sure.sum():5d} of {here.sum():5d}, "
-            f"wrong {100 * np.mean(~right[sure]):5.2f} %; "
-            f"right below 0.5: {100 * np.mean(probabilities[here & right] < 0.5):.1f} %"
-        )
+        confidences[here] = 1 / (1 + np.exp(-np.clip(terms[here] @ weights, -50, 50)))
+    return confidences
+
+
+def report(found: list[Example]) -> None:
+    """Print reliability by scene, disturbance, method and confidence, the bounds, and the weights."""
+    confidences = left_out_confidences(found)
+    right = np.array([one.is_right for one in found])
+    for kind in ("scene", "group", "method"):
+        print(f"{kind:18} poses   right   mean  over 0.9  wrong  found, right  error of calibration")
+        values = np.array([getattr(one, kind) for one in found])
+        for value in dict.fromkeys(values):
+            print(line(value, confidences[values == value], right[values == value]))
+    print(line("all", confidences, right))
     print("confidence   poses   mean   right")
     for low, high in pairwise(EDGES):
-        rows = (probabilities >= low) & (probabilities <= high if high == 1 else probabilities < high)
+        rows = (confidences >= low) & (confidences <= high if high == 1 else confidences < high)
         if rows.any():
             print(
-                f"{low:.2f} to {high:.2f} {rows.sum():6d}  {probabilities[rows].mean():.3f}  "
+                f"{low:.2f} to {high:.2f} {rows.sum():6d}  {confidences[rows].mean():.3f}  "
                 f"{right[rows].mean():.3f}"
             )
-    print("weights", np.round(learn(examples), 2).tolist())
+    print_bounds(found)
+    print("weights", np.round(learn(found), 2).tolist())
+
+
+def line(name: str, confidences: np.ndarray, right: np.ndarray) -> str:
+    """One row of a table of reliability."""
+    sure = confidences > 0.9
+    return (
+        f"{name:18} {len(right):5d}  {right.mean():6.3f} {confidences.mean():6.3f}  {sure.sum():8d} "
+        f"{np.sum(~right[sure]):6d}  {np.sum(right & (confidences >= 0.5)):12d}  "
+        f"{calibration_error(confidences, right):8.3f}"
+    )
+
+
+def calibration_error(confidences: np.ndarray, right: np.ndarray) -> float:
+    """Expected calibration error with ten bins."""
+    bins = np.minimum((10 * confidences).astype(int), 9)
+    parts = [bins == one for one in range(10)]
+    return sum(
+        part.mean() * abs(confidences[part].mean() - right[part].mean()) for part in parts if part.any()
+    )
+
+
+def print_bounds(found: Sequence[Example]) -> None:
+    """Print how many errors of right poses lie under their bounds."""
+    print("scene, method, estimated intrinsics: right poses, median and 95th percentile of error over bound")
+    kept = [one for one in found if one.is_right]
+    keys = sorted({(one.scene, one.method, int(one.num_estimated)) for one in kept})
+    for key in keys:
+        ratios = [one.error / one.bound for one in kept if (one.scene, one.method, one.num_estimated) == key]
+        print(
+            *key,
+            len(ratios),
+            *np.quantile(ratios, (0.5, 0.95)).round(2),
+            f"{np.mean(np.less(ratios, 1)):.0%}",
+        )
 
 
 if __name__ == "__main__":

@@ -23,39 +23,21 @@ from disturbed_report import Record, report
 from disturbed_scenes import NAMES, MappedScene, mapped_scene
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
-from slimsfm.localization.cameras import UnknownIntrinsicsError, guess_camera, query_camera
+from slimsfm.localization.cameras import query_camera
 from slimsfm.mapping import Map
 from slimsfm.progress import shown
-
-_NORMAL_95 = 1.96
 
 
 class UserLocalizer:
     """Localizes a file with what its user believes. The one place that knows how cameras are chosen."""
 
     def __init__(self, map: Map, strategy: str) -> None:
-        self.map = map
-        self._known, self._unknown = (
-            Localizer(map, LocalizationOptions(strategy=strategy, focal=focal, min_confidence=0))
-            for focal in ("known", "unknown")
-        )
+        self._localizer = Localizer(map, LocalizationOptions(strategy=strategy, min_confidence=0))
 
     def localize(self, query: DisturbedQuery) -> Localization:
-        """By the camera that is given or chosen, or with an unknown focal length where that is refused."""
-        try:
-            camera, localizer = query_camera(self.map, query.path, query.believed), self._known
-        except UnknownIntrinsicsError:
-            camera, localizer = guess_camera(*query.features.image_size), self._unknown
-        return localizer.localize_features(query.features, camera)
-
-
-def bound_95(found: Localization) -> float | None:
-    """What the true corner error should lie under in 95 of 100 poses.
-
-    Results have no such bound yet: it is as for a normal distribution with the predicted error as its sigma.
-    """
-    expected = found.predicted_corner_error
-    return None if expected is None else _NORMAL_95 * expected
+        """By the camera that is given or chosen."""
+        camera = query_camera(self._localizer.map, query.path, query.believed)
+        return self._localizer.localize_features(query.features, camera)
 
 
 def main() -> None:
@@ -115,7 +97,7 @@ def record(scene: MappedScene, method: str, query: DisturbedQuery, found: Locali
         has_pose=query.cam_from_world is not None,
         confidence=float((found.pose and found.pose.confidence) or 0),
         error=float(error),
-        bound=bound_95(found) if found.pose else None,
+        bound=found.pose.corner_bound(scene.full.box) if found.pose else None,
         relative_focal_error=float(found.camera.mean_focal_length() / true_focal - 1),
         inliers=found.pose.num_inliers if found.pose else 0,
         milliseconds=1000 * (found.seconds.match + found.seconds.pose),

@@ -6,7 +6,7 @@ import pytest
 from scenes import camera
 from slimsfm.localization import Localization, Seconds
 from slimsfm.localization.cameras import QueryCamera, guess_camera
-from slimsfm.localization.shared_cameras import share_cameras
+from slimsfm.localization.shared_cameras import corrected_cameras, share_cameras
 from slimsfm.pose import PoseEstimate, with_focal_length
 from slimsfm.synthetic.scene import look_at
 
@@ -63,6 +63,21 @@ def test_photos_of_one_camera_get_the_focal_length_that_some_of_them_agree_on():
 def test_otherwise_nothing_is_shared(focal_lengths, sigma, confidence):
     cameras = dict.fromkeys(NAMES, unknown())
     assert shared(cameras, focal_lengths, sigma, confidence)[0] == cameras
+
+
+def test_a_camera_that_most_queries_contradict_is_replaced_for_the_others():
+    believed = QueryCamera(camera=camera(), source="map")
+    cameras = dict.fromkeys(NAMES[:6], believed)
+    kept = replace(localized(500.0, 0.03), camera=camera())
+    estimated = replace(kept, pose=replace(kept.pose, estimated=("focal length",)))
+    found = dict(zip(cameras, [estimated, kept, estimated, estimated, estimated, kept], strict=True))
+    again = corrected_cameras(cameras, found)
+    assert list(again) == [NAMES[1], NAMES[5]]
+    assert {one.source for one in again.values()} == {"queries"}
+    assert again[NAMES[1]].camera.mean_focal_length() == pytest.approx(500.0)
+    few = dict(zip(cameras, [estimated, kept, estimated, estimated, kept, kept], strict=True))
+    assert corrected_cameras(cameras, few) == {}
+    assert corrected_cameras(cameras, dict.fromkeys(cameras, kept)) == {}
 
 
 def test_known_cameras_and_single_photos_are_left_alone():

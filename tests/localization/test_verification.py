@@ -8,13 +8,25 @@ from scenes import camera, exact_map, poses
 from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.point_descriptors import describe_points
+from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
+from slimsfm.localization.search import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
+from slimsfm.localization.strategy import PointMatches
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import GlobalDescriptors, observed
 from slimsfm.mapping.support import measure
 
-GOOD = Evidence(inliers=80, distinct=60, matched=100, predicted_error=0.004, rival=0, found=0.6)
+GOOD = Evidence(
+    inliers=80,
+    distinct=60,
+    matched=100,
+    predicted_error=0.004,
+    rival=0,
+    found=0.6,
+    uncalibrated_error=0.03,
+    misfit=0.1,
+    cells=25,
+)
 WORSE = {
     "inliers": [70, 40, 15],
     "distinct": [40, 10, 0],
@@ -22,6 +34,10 @@ WORSE = {
     "predicted_error": [0.01, 0.05, 2.0],
     "rival": [10, 40, 80],
     "found": [0.4, 0.1, -0.1],
+    "uncalibrated_error": [0.05, 0.2, 3.0],
+    "misfit": [0.3, 0.9, 20.0],
+    "cells": [20, 5, 1],
+    "facing": [0.9, 0.4, 0.0],
 }
 
 
@@ -50,6 +66,46 @@ def test_an_exact_view_has_full_evidence(exact):
     assert evidence.rival == 0
     assert evidence.found > 0.9
     assert last.pose.confidence == evidence.confidence > 0.9
+
+
+def test_a_pose_that_sees_the_surface_from_behind_is_not_believed():
+    one_sided = exact_map(num_images=30, num_points=300, reach_deg=60.0)
+    points, pose = one_sided.points3D_in_world, poses(30)[3]
+    towards = pose.inverse().translation - points
+    behind = np.einsum("nd,nd->n", viewing_directions(one_sided), towards) < 0
+    descriptors = mean_descriptors(one_sided).descriptors
+    for rows, is_behind in ((np.flatnonzero(behind), True), (np.flatnonzero(~behind), False)):
+        query = Features(
+            keypoints=project(points[rows], pose, camera()).astype(np.float32),
+            descriptors=descriptors[rows],
+            scores=np.ones(len(rows), np.float32),
+            image_size=(640, 480),
+        )
+        last = found_with(one_sided, query, camera())
+        assert last.evidence.inliers > 50
+        assert last.evidence.is_behind == is_behind
+        assert (last.pose.confidence < 0.05) == is_behind
+
+
+def test_a_search_does_not_stop_with_accurate_inliers_in_one_corner():
+    def round_with(evidence):
+        nothing = PointMatches.none()
+        return RoundResult(
+            matches=nothing,
+            pose=None,
+            camera=camera(),
+            evidence=evidence,
+            match_seconds=0.0,
+            pose_seconds=0.0,
+        )
+
+    sure = replace(GOOD, inliers=400, distinct=390, matched=410, predicted_error=0.001)
+    assert sure.confidence > 0.95
+    corner = replace(sure, cells=4, inliers=400)
+    assert suffices([round_with(sure)])
+    assert not suffices([round_with(corner)])
+    assert not suffices([round_with(None)])
+    assert not suffices([round_with(replace(sure, predicted_error=0.02))])
 
 
 def test_next_to_contradicted_images_the_confidence_is_lower_and_elsewhere_it_is_not(exact):

@@ -1,6 +1,6 @@
 """Localize images against several maps, and all images of a folder on several threads."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from slimsfm.features import Features
 from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import QueryCamera, query_camera
 from slimsfm.localization.localizer import Localization, Localizer
-from slimsfm.localization.shared_cameras import share_cameras
+from slimsfm.localization.shared_cameras import corrected_cameras, share_cameras
 from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
@@ -148,11 +148,15 @@ def _localize(
 ) -> dict[str, dict[str, Localization]]:
     if workers is not None and workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
-    tasks = _with_shared_cameras(_tasks(localizer, images, camera), localizer, gravity, workers)
-    run = map_on_threads(partial(_localize_one, localizer, gravity), tasks, workers or num_cores())
+    run = partial(_localize_all, localizer, gravity, workers or num_cores())
+    tasks = _with_shared_cameras(_tasks(localizer, images, camera), localizer, run)
     strategies = {one.options.strategy_for(one.map) for one in localizer.localizers.values()}
     label = f"localize ({', '.join(sorted(strategies))})"
-    by_image = {task.name: next(run) for task in progress(tasks, label)}
+    outcomes = run(tasks)
+    by_image = {task.name: next(outcomes) for task in progress(tasks, label)}
+    again = list(_with_corrected_cameras(tasks, localizer, by_image))
+    for task, found in zip(again, run(again), strict=True):
+        by_image[task.name] = {**by_image[task.name], **found}
     return {key: {name: outcomes[key] for name, outcomes in by_image.items()} for key in localizer.localizers}
 
 
@@ -173,38 +177,56 @@ def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | No
     ]
 
 
-def _with_shared_cameras(
-    tasks: list[_Task], localizer: MultiLocalizer, gravity: Mapping[str, Gravity], workers: int | None
-) -> list[_Task]:
+def _with_shared_cameras(tasks: list[_Task], localizer: MultiLocalizer, run: "_Run") -> list[_Task]:
     """The images, with focal lengths that those of one camera agree on where the user leaves it open."""
     by_name = {task.name: task for task in tasks}
     for key, one in localizer.localizers.items():
-        if one.options.focal != "auto":
-            continue
-        alone = MultiLocalizer({key: one})
-
-        def localize(
-            names: Sequence[str], key: str = key, alone: MultiLocalizer = alone
-        ) -> list[Localization]:
-            some = [by_name[name] for name in names]
-            run = map_on_threads(partial(_localize_one, alone, gravity), some, workers or num_cores())
-            return [found[key] for found in run]
-
-        shared = share_cameras({name: task.cameras[key] for name, task in by_name.items()}, localize)
-        for name, camera in shared.items():
-            by_name[name] = by_name[name]._replace(cameras={**by_name[name].cameras, key: camera})
+        if one.options.focal == "auto":
+            cameras = {task.name: task.cameras[key] for task in tasks}
+            shared = share_cameras(cameras, lambda some, key=key: _outcomes(run, by_name, some, key))
+            for name, camera in shared.items():
+                by_name[name] = by_name[name]._replace(cameras={**by_name[name].cameras, key: camera})
     return list(by_name.values())
+
+
+def _outcomes(run: "_Run", tasks: Mapping[str, _Task], names: Sequence[str], key: str) -> list[Localization]:
+    some = [tasks[name]._replace(cameras={key: tasks[name].cameras[key]}) for name in names]
+    return [found[key] for found in run(some)]
+
+
+def _with_corrected_cameras(
+    tasks: list[_Task], localizer: MultiLocalizer, by_image: Mapping[str, Mapping[str, Localization]]
+) -> Iterator[_Task]:
+    """The images to localize again, because most others of their camera contradicted it."""
+    for key, one in localizer.localizers.items():
+        if one.options.focal == "auto":
+            cameras = {task.name: task.cameras[key] for task in tasks}
+            found = {name: outcomes[key] for name, outcomes in by_image.items()}
+            corrected = corrected_cameras(cameras, found)
+            yield from (
+                task._replace(cameras={key: corrected[task.name]}) for task in tasks if task.name in corrected
+            )
+
+
+_Run = Callable[[Sequence[_Task]], Iterator[dict[str, Localization]]]
+
+
+def _localize_all(
+    localizer: MultiLocalizer, gravity: Mapping[str, Gravity], workers: int, tasks: Sequence[_Task]
+) -> Iterator[dict[str, Localization]]:
+    return map_on_threads(partial(_localize_one, localizer, gravity), tasks, workers)
 
 
 def _localize_one(
     localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
 ) -> dict[str, Localization]:
-    """Localize an image against all maps; it is read as each of them says."""
+    """Localize an image against the maps that its task has cameras for; it is read as each of them says."""
     found: dict[str, Localization] = {}
+    wanted = {key: one for key, one in localizer.localizers.items() if key in task.cameras}
     for orientation in get_args(Orientation):
-        alike = {k: one for k, one in localizer.localizers.items() if one.map.info.orientation == orientation}
+        alike = {k: one for k, one in wanted.items() if one.map.info.orientation == orientation}
         if alike:
             photo = read_photo(task.path, orientation)
             multi, down = MultiLocalizer(alike), gravity.get(task.name)
             found |= multi.localize(photo.image, task.cameras, down, photo.visible)
-    return {key: found[key] for key in localizer.localizers}
+    return {key: found[key] for key in wanted}

@@ -265,6 +265,11 @@ class Localizer:
         query = self._query(features, camera.camera, image)
         return self._localization(query, self._search.run(query, camera, gravity), camera, 0.0)
 
+    def search(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> SearchResult:
+        """Localize an image by its features, with the evidence, and without a limit on the confidence."""
+        camera = _given(camera)
+        return self._search.run(self._query(features, camera.camera), camera)
+
     def rounds(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> Iterator[RoundResult]:
         """Run all rounds of the strategy, without stopping early."""
         camera = _given(camera)

@@ -51,6 +51,19 @@ def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
     return np.zeros((0, 0), np.float32) if sums is None else sums
 
 
+def viewing_directions(map: Map) -> Float32[np.ndarray, "points 3"]:
+    """The stored viewing direction of each point, else the mean over the images that observe it.
+
+    Zeros where neither is known.
+    """
+    described = map.point_descriptors
+    if map.features or described is None or described.directions is None:
+        return _directions(map)
+    directions = np.zeros((len(map.point3D_ids), 3), np.float32)
+    directions[described.points] = described.directions
+    return directions
+
+
 def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:
     """Mean of the unit vectors from each point towards the cameras that observe it."""
     sums = np.zeros((len(map.point3D_ids), 3))

@@ -23,7 +23,7 @@ SURE = 0.95
 MIN_REFUTING = 2
 """Number of images that could have contradicted an ambiguous pose, before the search may stop."""
 
-ACCURATE = 0.006
+ACCURATE = 0.007
 """Predicted relative corner error up to which a pose is accurate."""
 
 SPREAD = 10
@@ -108,9 +108,10 @@ class Search:
         rounds: list[RoundResult] = []
         for one in self.rounds(query, camera, gravity):
             rounds.append(one)
-            if _suffices(rounds):
+            if suffices(rounds):
                 return _summed(rounds)
-        if rounds and self._focal == "auto" and camera.source in TRUSTED:
+        is_sure = rounds and rounds[-1].confidence >= SURE
+        if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
             rounds.append(self._with_any_focal_length(query, rounds[-1], camera))
         return _summed(rounds)
 
@@ -236,7 +237,7 @@ class _Shrunk(NamedTuple):
         return enlarged
 
 
-def _suffices(rounds: list[RoundResult]) -> bool:
+def suffices(rounds: list[RoundResult]) -> bool:
     """Whether the last pose is sure, and not improving much, or accurate by inliers all over the object.
 
     Inliers in one corner may agree with each other more exactly than with the rest, as repeated texture does.

@@ -11,6 +11,7 @@ import numpy as np
 
 from slimsfm.localization.cameras import QueryCamera
 from slimsfm.localization.localizer import Localization
+from slimsfm.localization.search import TRUSTED
 from slimsfm.pose.types import with_focal_length
 
 _SAMPLED = 8  # photos of a camera that its focal length is estimated from
@@ -36,24 +37,54 @@ def share_cameras(cameras: Mapping[str, QueryCamera], localize: Localize) -> dic
     Returns:
         The intrinsics of each query; where they are shared, their source is "queries".
     """
+    shared = dict(cameras)
+    for names in _groups(cameras):
+        if cameras[names[0]].source in ("exif", "unknown"):
+            places = np.linspace(0, len(names) - 1, min(_SAMPLED, len(names))).round().astype(int)
+            focal_px = _agreed_focal_length(localize([names[place] for place in places]))
+            shared.update(_with_focal_length(cameras, names, focal_px))
+    return shared
+
+
+def corrected_cameras(
+    cameras: Mapping[str, QueryCamera], found: Mapping[str, Localization]
+) -> dict[str, QueryCamera]:
+    """The queries whose camera was believed although most others of that camera contradicted it.
+
+    Args:
+        cameras: The intrinsics that each query was localized with, by its name.
+        found: The outcome of each query.
+
+    Returns:
+        The intrinsics that the others agree on, for each query that should be localized again.
+    """
+    again: dict[str, QueryCamera] = {}
+    for names in _groups(cameras):
+        corrected = [name for name in names if found[name].camera_estimated]
+        localized = [name for name in names if found[name].pose]
+        left = [name for name in names if not found[name].camera_estimated]
+        if cameras[names[0]].source in TRUSTED and left and 2 * len(corrected) > len(localized):
+            focal_px = _agreed_focal_length([found[name] for name in corrected])
+            again.update(_with_focal_length(cameras, left, focal_px))
+    return again
+
+
+def _groups(cameras: Mapping[str, QueryCamera]) -> list[list[str]]:
+    """Names of the queries that seem to be of one camera, if they are enough."""
     groups: dict[tuple, list[str]] = defaultdict(list)
     for name, one in cameras.items():
-        if one.source in ("exif", "unknown"):
-            size = one.camera.width, one.camera.height
-            groups[one.source, size, tuple(one.camera.params)].append(name)
-    shared = dict(cameras)
-    for names in groups.values():
-        if len(names) < _LEAST:
-            continue
-        places = np.linspace(0, len(names) - 1, min(_SAMPLED, len(names))).round().astype(int)
-        focal_px = _agreed_focal_length(localize([names[place] for place in places]))
-        if focal_px is not None:
-            camera = with_focal_length(cameras[names[0]].camera, focal_px)
-            shared.update(
-                (name, QueryCamera(camera=camera, source="queries", notes=cameras[name].notes))
-                for name in names
-            )
-    return shared
+        size = one.camera.width, one.camera.height
+        groups[one.source, size, tuple(one.camera.params)].append(name)
+    return [names for names in groups.values() if len(names) >= _LEAST]
+
+
+def _with_focal_length(
+    cameras: Mapping[str, QueryCamera], names: Sequence[str], focal_px: float | None
+) -> dict[str, QueryCamera]:
+    if focal_px is None:
+        return {}
+    camera = with_focal_length(cameras[names[0]].camera, focal_px)
+    return {name: QueryCamera(camera=camera, source="queries", notes=cameras[name].notes) for name in names}
 
 
 def _agreed_focal_length(found: Sequence[Localization]) -> float | None:

@@ -28,12 +28,13 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
+from slimsfm.localization.point_descriptors import viewing_directions
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import misfit
 
-EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1])
+EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1, 0.0, 0.0, 0.0, 0.0])
 """Weights of `Evidence.terms`, learned by `benchmarks/confidence.py`."""
 
 RIVAL_RANSAC = RansacOptions(min_inliers=6, max_iterations=150)
@@ -43,6 +44,9 @@ UNAMBIGUOUS = 0.75
 """Share of distinct inliers from which a pose is unambiguous."""
 
 _DOUBTED = 0.6  # of the confidence, next to contradicted images
+_BEHIND = 0.02  # of the confidence, where most points are seen from behind: a mirrored photo of a plane is
+_LEAST_FACING = 0.5  # share of the points that must be seen from the side they were seen from
+_ONE_SIDED = 0.3  # length of a point's mean viewing direction from which it has a side
 _CELLS = 16  # squares along the longer side of the image
 _NEAREST = 3  # images that are next to a pose
 _CHECKED = 100  # visible points to look for
@@ -73,14 +77,17 @@ class Evidence:
     found: float
     """Share of the points that should be visible that are found where they project and nowhere else."""
 
-    uncalibrated_error: float = 0.0
+    uncalibrated_error: float
     """Predicted relative corner error if nothing but the matches said what the intrinsics are."""
 
-    misfit: float = 0.0
+    misfit: float
     """How much the matches contradict the intrinsics: 1 is where more of them would have been estimated."""
 
-    cells: int = 0
+    cells: int
     """Number of squares, a sixteenth of the longer side wide, with keypoints that agree with the pose."""
+
+    facing: float = 1.0
+    """Share of the points that agree with the pose and that it sees from the side they were seen from."""
 
     doubted: bool = False
     """Whether matches contradict the poses of the reference images next to the pose."""
@@ -89,7 +96,14 @@ class Evidence:
     def confidence(self) -> float:
         """Probability that the pose is right."""
         on_right_map = float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
+        if self.is_behind:
+            return on_right_map * _BEHIND
         return on_right_map * (_DOUBTED if self.doubted else 1.0)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the pose sees the surface from behind, as that of a mirrored photo of a plane does."""
+        return self.facing < _LEAST_FACING
 
     @property
     def is_ambiguous(self) -> bool:
@@ -108,6 +122,10 @@ class Evidence:
                 -np.log(max(self.rival, 6) / 6),
                 -min(self.rival / self.inliers, 1.0),
                 self.found,
+                -np.log(np.clip(self.predicted_error, 0.04, 1.0) / 0.04),
+                -np.log(np.clip(self.uncalibrated_error, 0.02, 1.0) / 0.1),
+                -min(self.misfit, 1.0),
+                np.log(np.clip(self.cells, 1, 30) / 10),
             ]
         )
 
@@ -129,6 +147,7 @@ class Verifier:
         self._alike = map.descriptor_metric.max_distance
         self._distinct = distinct
         self._doubtful = _doubtful_images(map)
+        self._directions = viewing_directions(map)
         self._centers = np.array([image.projection_center() for image in map.images.values()])
 
     def evidence(
@@ -154,8 +173,16 @@ class Verifier:
             uncalibrated_error=self._uncalibrated_error(pose),
             misfit=misfit(pose.check, pose.estimated) if pose.check else 0.0,
             cells=_cells(matches.pixels(query)[pose.inliers], camera),
+            facing=self._facing(points, pose),
             doubted=self._doubted(pose),
         )
+
+    def _facing(self, points: Ids, pose: PoseEstimate) -> float:
+        """Share of points that are seen from the side from which the references saw them."""
+        directions = self._directions[points]
+        towards = pose.cam_from_world.inverse().translation - self._points3D_in_world[points]
+        sided = np.linalg.norm(directions, axis=1) > _ONE_SIDED
+        return 1 - float(np.mean(sided & (np.einsum("nd,nd->n", towards, directions) < 0)))
 
     def _uncalibrated_error(self, pose: PoseEstimate) -> float:
         if pose.covariance is None or pose.check is None:

@@ -34,7 +34,8 @@ _NEAR = 2.5  # times the largest error of an inlier: a right match of a wrong ca
 _CAUCHY = 2.385  # scale of the loss in sigmas
 _SHARPEST_PX = 0.3  # smallest sigma that a check assumes
 _DECREASES = {"focal length": 10.0, "principal point": 14.0, "pixel aspect ratio": 13.0}  # that convince
-_CHANGES = {"focal length": 0.03, "principal point": 0.03, "pixel aspect ratio": 0.03}  # that matter
+_CHANGES = {"focal length": 0.03, "principal point": 0.05, "pixel aspect ratio": 0.04}  # beyond autofocus
+# and optical stabilization, which shift a phone's principal point by up to 0.03 focal lengths
 _PLACES = {
     "focal length": [0],
     "principal point": [1, 2],
