@@ -5,12 +5,13 @@ import pytest
 
 from scenes import camera, poses
 from slimsfm.localization import Localization, Localizer, Seconds
+from slimsfm.localization.cameras import QueryCamera
 from slimsfm.pose import PoseEstimate
 from slimsfm.tracking import Tracker, TrackerOptions
 from slimsfm.tracking.background import Relocalizer
 
 BLACK = np.zeros((480, 640, 3), np.uint8)
-CAMERA = camera()
+CAMERA = QueryCamera(camera=camera(), source="given")
 LAST = poses(6)[0]
 
 
@@ -18,7 +19,7 @@ def found(confidence):
     pose = PoseEstimate(cam_from_world=LAST, inliers=np.zeros(0, bool), confidence=confidence)
     return Localization(
         pose=None if confidence is None else pose,
-        camera=CAMERA,
+        camera=CAMERA.camera,
         points2D=np.zeros((0, 2)),
         points3D_in_world=np.zeros((0, 3)),
         references=0,
