@@ -61,7 +61,9 @@ class Relocalizer:
     def _accepted(self, found: Localization) -> Localization:
         confidence = found.pose and found.pose.confidence
         sure = confidence is None or confidence >= self._min_confidence
-        if sure and (found.predicted_corner_error or 0.0) <= MAX_CORNER_ERROR:
+        # an estimated focal length leaves the distance uncertain, which is no second pose
+        exact = found.camera_estimated or (found.predicted_corner_error or 0.0) <= MAX_CORNER_ERROR
+        if sure and exact:
             return found
         return replace(found, pose=None, predicted_corner_error=None)
 
