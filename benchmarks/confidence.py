@@ -27,6 +27,12 @@ from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import query_camera
 from slimsfm.progress import shown
 
+EXPECTED = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1, 0.4, 1.5, 3.0, 0.3])
+NEARNESS = 0.2
+"""Weights that are kept unless the examples speak against them, and how much they count. The first seven were
+learned from scenes that deceive and from queries with a twelfth of their keypoints, which tell more about
+rivals and few inliers than disturbed queries do."""
+
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.99, 1.0)
 
 
@@ -112,7 +118,7 @@ def read_examples(path: Path) -> list[Example]:
 
 
 def learn(found: Sequence[Example]) -> np.ndarray:
-    """Logistic regression with equal weights for all scenes; only the constant may be negative."""
+    """Logistic regression with equal weights for all scenes, near `EXPECTED`; only the constant is free."""
     terms = np.array([one.terms for one in found])
     signs = np.array([1.0 if one.is_right else -1.0 for one in found])
     names = [one.scene for one in found]
@@ -121,12 +127,13 @@ def learn(found: Sequence[Example]) -> np.ndarray:
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
         margins = signs * (terms @ values)
         slopes = -signs * weights / (1 + np.exp(np.clip(margins, -50, 50)))
-        shrink = 1e-3 * values[1:]
-        value = weights @ np.logaddexp(0, -margins) + shrink @ values[1:] / 2
+        off = (values - EXPECTED)[1:]
+        shrink = NEARNESS * off
+        value = weights @ np.logaddexp(0, -margins) + shrink @ off / 2
         return value, terms.T @ slopes + np.concatenate([[0.0], shrink])
 
     bounds = [(None, None), *[(0.0, None)] * (terms.shape[1] - 1)]
-    return minimize(loss, np.zeros(terms.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
+    return minimize(loss, EXPECTED, jac=True, bounds=bounds, method="L-BFGS-B").x
 
 
 def left_out_confidences(found: Sequence[Example]) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Confidence of a pose: the probability that its corner error is below 0.1 of the diagonal.
 
 Repeated texture, a second object that looks the same, or a few chance outliers give wrong poses with many
-consistent inliers, so counting inliers is not enough. The confidence uses five quantities that are rarely
-good for a wrong pose:
+consistent inliers, and so does a wrong camera: counting inliers is not enough. The confidence
+uses quantities that are rarely good for a wrong pose:
 
     distinct    number of keypoints that agree with the pose and whose point looks like no other of the map
     share       share of the matched keypoints that agree with the pose
@@ -11,10 +11,14 @@ good for a wrong pose:
                 this one
     found       share of the points that should be visible that have a similar keypoint where they project,
                 and no equally similar one elsewhere
+    intrinsics  the corner error that a wrong camera could cause without being noticed, and how much the
+                matches contradict the camera
+    spread      number of squares of the image with inliers
 
 Their weighted sum is the log-odds that the pose is right. The weights come from logistic regression on
-rendered and photographed scenes, some of them built to deceive; signs are constrained to the plausible ones.
-`benchmarks/confidence.py` learns the weights and measures the calibration on held-out scenes.
+rendered and photographed scenes, whose queries are zoomed, cropped, blurred, dark, hidden, mirrored, or of
+another scene; signs are constrained to the plausible ones. `benchmarks/confidence.py` learns the weights and
+measures the calibration on held-out scenes. A pose that sees the surface from behind is not believed at all.
 
 This holds on right maps. Next to images that the map's own matches contradict, because the map may be folded
 there, 60 % of the confidence remains.
