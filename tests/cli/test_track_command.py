@@ -108,10 +108,10 @@ def test_a_folder_is_tracked_image_by_image(boulder, images, tmp_path):
     assert names == ["name", "0.png", "1.png", "2.png"]
 
 
-def test_a_camera_file_is_used(boulder, video, tmp_path):
+def test_a_camera_file_is_used_as_it_is_on_request(boulder, video, tmp_path):
     line = "1 PINHOLE 640 480 780 780 320 240\n"
     (tmp_path / "camera.txt").write_text(line)
-    arguments = (boulder.map_path, video, "--camera", tmp_path / "camera.txt")
+    arguments = (boulder.map_path, video, "--camera", tmp_path / "camera.txt", "--focal", "known")
     assert slimsfm("track", *arguments, "-o", tmp_path / "other.json").code == 0
     assert slimsfm("track", boulder.map_path, video, "-o", tmp_path / "own.json").code == 0
     own, other = (
