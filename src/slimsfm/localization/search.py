@@ -112,13 +112,15 @@ class Search:
                 return _summed(rounds)
         is_sure = rounds and rounds[-1].confidence >= SURE
         if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
-            rounds.append(self._with_any_focal_length(query, rounds[-1], camera))
+            rounds.append(self._with_any_focal_length(query, rounds[-1], camera, gravity))
         return _summed(rounds)
 
-    def _with_any_focal_length(self, query: Query, last: RoundResult, camera: QueryCamera) -> RoundResult:
+    def _with_any_focal_length(
+        self, query: Query, last: RoundResult, camera: QueryCamera, gravity: Gravity | None
+    ) -> RoundResult:
         """The last round again, as if nobody knew the focal length; the round itself if that is no better."""
         unknown = replace(camera, source="unknown")
-        again = self._result(query, last.matches, unknown, perf_counter())
+        again = self._result(query, last.matches, unknown, perf_counter(), gravity)
         inliers = [one.pose.num_inliers if one.pose else 0 for one in (last, again)]
         is_better = inliers[1] > _MORE * inliers[0] and again.confidence > last.confidence
         return again if is_better else replace(last, match_seconds=0.0, pose_seconds=again.pose_seconds)
@@ -192,7 +194,9 @@ class Search:
         if self._focal == "known":
             pose = with_check(points2D, points3D, pose, shrunk.camera, self._ransac)
         else:
-            pose = fit_camera(points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal)
+            pose = fit_camera(
+                points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal, gravity=gravity
+            )
         inflation = _INFLATION[min(len(pose.estimated), len(_INFLATION) - 1)]
         return replace(pose, covariance=None if pose.covariance is None else inflation**2 * pose.covariance)
 

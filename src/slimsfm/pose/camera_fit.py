@@ -25,6 +25,7 @@ from slimsfm.pose.types import (
     CameraCheck,
     FocalPrior,
     FramePrior,
+    Gravity,
     PoseEstimate,
     projection_jacobian,
     with_two_focal_lengths,
@@ -139,7 +140,7 @@ def with_check(
     options: RansacOptions = RansacOptions(),
 ) -> PoseEstimate:
     """Check the intrinsics that a pose was estimated with, and keep them; arguments as in `fit_camera`."""
-    return _CameraSearch(points2D, points3D_in_world, camera, options, None).checked(found)
+    return _CameraSearch(points2D, points3D_in_world, camera, options).checked(found)
 
 
 def fit_camera(
@@ -150,6 +151,7 @@ def fit_camera(
     options: RansacOptions = RansacOptions(),
     *,
     focal: FocalPrior | None = None,
+    gravity: Gravity | None = None,
 ) -> PoseEstimate:
     """Check the intrinsics that a pose was estimated with, and estimate those that the matches contradict.
 
@@ -164,11 +166,12 @@ def fit_camera(
         camera: The intrinsics that it was estimated with.
         options: How it was estimated.
         focal: The prior with which the focal length was estimated; None if it was taken as known.
+        gravity: The direction of gravity with which it was estimated.
 
     Returns:
         The pose with its `check`; with another `camera` and `estimated` if intrinsics were contradicted.
     """
-    search = _CameraSearch(points2D, points3D_in_world, camera, options, focal)
+    search = _CameraSearch(points2D, points3D_in_world, camera, options, focal, gravity)
     best = search.checked(found)
     while best.check and misfit(best.check, best.estimated) > 1:
         misfits = _misfits(best.check, best.estimated)
@@ -185,7 +188,8 @@ class _CameraSearch:
     points3D_in_world: Points3D
     camera: pycolmap.Camera
     options: RansacOptions
-    focal: FocalPrior | None
+    focal: FocalPrior | None = None
+    gravity: Gravity | None = None
 
     def checked(self, pose: PoseEstimate) -> PoseEstimate:
         camera = pose.camera or self.camera
@@ -232,6 +236,7 @@ class _CameraSearch:
                 max_error_px=factor * self.options.max_error_px,
                 focal=prior,
                 frame=frame,
+                gravity=self.gravity,
             )
             start, camera = one.cam_from_world, one.camera or camera
         enough = one.covariance is not None and one.num_inliers >= self.options.min_inliers
@@ -239,7 +244,14 @@ class _CameraSearch:
 
     def _searched(self) -> PoseEstimate | None:
         prior = FocalPrior.of(self.camera)
-        one = estimate_pose(self.points2D, self.points3D_in_world, self.camera, self.options, focal=prior)
+        one = estimate_pose(
+            self.points2D,
+            self.points3D_in_world,
+            self.camera,
+            self.options,
+            focal=prior,
+            gravity=self.gravity,
+        )
         return one and replace(one, estimated=(FOCAL_LENGTH,))
 
     def _gain(self, before: PoseEstimate, after: PoseEstimate) -> float:
