@@ -38,7 +38,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import misfit
 
-EVIDENCE_WEIGHTS = np.array([3.3, 0.95, 0.6, 0.55, 1.2, 1.05, 1.1, 0.0, 0.0, 0.0, 0.0])
+EVIDENCE_WEIGHTS = np.array([2.87, 0.18, 0.27, 0.17, 0.99, 1.01, 0.96, 0.26, 1.36, 3.16, 0.09])
 """Weights of `Evidence.terms`, learned by `benchmarks/confidence.py`."""
 
 RIVAL_RANSAC = RansacOptions(min_inliers=6, max_iterations=150)
