@@ -7,23 +7,22 @@ from time import perf_counter
 import numpy as np
 import pycolmap
 
-from slimsfm.arrays import GrayImage, Image, Points2D, Points3D
+from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import MapError
 from slimsfm.features import Features, load_extractor, shrink_factor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import (
-    CameraSource,
     FocalLength,
     QueryCamera,
     camera_in_memory,
 )
 from slimsfm.localization.matching import extract_near
+from slimsfm.localization.outcome import Localization, Seconds
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.descriptors import descriptor_length
 from slimsfm.mapping.map import Map
-from slimsfm.photos import Orientation
-from slimsfm.pose import Gravity, PoseEstimate, RansacOptions
+from slimsfm.pose import Gravity, RansacOptions
 
 # Paths, not classes: naming a strategy must not import its dependencies.
 STRATEGIES = {
@@ -102,70 +101,6 @@ def supports(strategy: str, map: Map) -> bool:
 
 def _strategy_class(name: str) -> Callable[[Map, MatchingOptions], Strategy]:
     return load_object({**plugins("strategy"), **STRATEGIES}[name])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Seconds:
-    """Wall time of each stage."""
-
-    extract: float
-    """Extracting the features of the query."""
-
-    match: float
-    """Matching the query with the map."""
-
-    pose: float
-    """Estimating and verifying poses."""
-
-    @property
-    def total(self) -> float:
-        """Sum of all stages."""
-        return self.extract + self.match + self.pose
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Localization:
-    """Outcome of one query."""
-
-    pose: PoseEstimate | None
-    """Pose of the camera; None if the query could not be localized."""
-
-    camera: pycolmap.Camera
-    """The intrinsics, with those that were estimated."""
-
-    camera_source: CameraSource = "given"
-    """Where the intrinsics come from, apart from those that were estimated."""
-
-    camera_notes: tuple[str, ...] = ()
-    """Sentences that name the image, on what was ignored when its camera was chosen."""
-
-    points2D: Points2D
-    """Pixels of the 2D-3D matches that the pose was estimated from."""
-
-    points3D_in_world: Points3D
-    """Point of the map for each of these pixels."""
-
-    references: int
-    """Number of reference images that the query was matched with."""
-
-    predicted_corner_error: float | None = None
-    """Expected relative corner error of the pose, if its inliers are right; None if there is no pose."""
-
-    seconds: Seconds
-    """Wall time per stage."""
-
-    orientation: Orientation = "upright"
-    """Which pixels of the image the pose is of: as in the map."""
-
-    @property
-    def camera_estimated(self) -> tuple[str, ...]:
-        """Which intrinsics were estimated: "focal length", "principal point", "pixel aspect ratio"."""
-        return self.pose.estimated if self.pose else ()
-
-    @property
-    def num_matches(self) -> int:
-        """Number of 2D-3D matches."""
-        return len(self.points2D)
 
 
 class Localizer:

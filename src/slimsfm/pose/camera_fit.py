@@ -14,21 +14,23 @@ from jaxtyping import Float64
 from slimsfm.arrays import Points2D, Points3D
 from slimsfm.geometry import reprojection_errors
 from slimsfm.pose.estimation import estimate_pose
-from slimsfm.pose.ransac import PinholeMatches, RansacOptions
-from slimsfm.pose.refinement import refine_pose
-from slimsfm.pose.types import (
+from slimsfm.pose.priors import (
     ASPECT,
     CENTER,
     FOCAL,
-    MIN_SIGMA_PX,
     UNKNOWNS,
-    CameraCheck,
     FocalPrior,
     FramePrior,
     Gravity,
+    with_two_focal_lengths,
+)
+from slimsfm.pose.ransac import PinholeMatches, RansacOptions
+from slimsfm.pose.refinement import refine_pose
+from slimsfm.pose.types import (
+    MIN_SIGMA_PX,
+    CameraCheck,
     PoseEstimate,
     projection_jacobian,
-    with_two_focal_lengths,
 )
 
 _NEAR = 2.5  # times the largest error of an inlier: a right match of a wrong camera may be that far off

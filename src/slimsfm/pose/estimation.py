@@ -6,6 +6,12 @@ import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Points2D, Points3D
+from slimsfm.pose.priors import (
+    FocalPrior,
+    Gravity,
+    check_has_focal_length,
+    with_focal_length,
+)
 from slimsfm.pose.ransac import (
     P3P_SAMPLE,
     PinholeMatches,
@@ -17,12 +23,8 @@ from slimsfm.pose.ransac import (
 )
 from slimsfm.pose.refinement import refine_pose
 from slimsfm.pose.types import (
-    FocalPrior,
-    Gravity,
     PoseEstimate,
-    check_has_focal_length,
     pose_covariance,
-    with_focal_length,
 )
 
 _MIN_INLIERS = 4  # of a hypothesis at a focal length that may be wrong

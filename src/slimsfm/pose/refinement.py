@@ -9,18 +9,20 @@ from jaxtyping import Bool, Float64
 
 from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.geometry import motions, project, reprojection_errors
-from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
-from slimsfm.pose.types import (
+from slimsfm.pose.priors import (
     FOCAL,
-    MIN_SIGMA_PX,
     UNKNOWNS,
     FocalPrior,
     FramePrior,
     Gravity,
-    PoseEstimate,
     Prior,
-    pose_covariance,
     with_focal_length,
+)
+from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
+from slimsfm.pose.types import (
+    MIN_SIGMA_PX,
+    PoseEstimate,
+    pose_covariance,
 )
 
 _ROUNDS = 8  # of choosing inliers; 2 to 4 are common
