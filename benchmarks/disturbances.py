@@ -14,9 +14,7 @@ import pycolmap
 
 from slimsfm.arrays import Image
 from slimsfm.geometry import Box, project
-from slimsfm.pose.priors import (
-    with_focal_length,
-)
+from slimsfm.pose.priors import with_focal_length
 from slimsfm.synthetic import texture
 
 _FILM_DIAGONAL_MM = float(np.hypot(36, 24))

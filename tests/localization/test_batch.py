@@ -16,9 +16,7 @@ from slimsfm.localization import (
 from slimsfm.localization.cameras import read_gravity
 from slimsfm.localization.pose_files import write_object_poses, write_poses
 from slimsfm.photos import read_image
-from slimsfm.pose.priors import (
-    Gravity,
-)
+from slimsfm.pose.priors import Gravity
 
 
 def assert_same_outcomes(some, others):

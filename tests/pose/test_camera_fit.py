@@ -16,12 +16,8 @@ from slimsfm.pose.camera_fit import (
     misfit,
     with_check,
 )
-from slimsfm.pose.priors import (
-    with_two_focal_lengths,
-)
-from slimsfm.pose.types import (
-    bound_95,
-)
+from slimsfm.pose.priors import with_two_focal_lengths
+from slimsfm.pose.types import bound_95
 from slimsfm.synthetic.scene import look_at
 
 LENS = camera("SIMPLE_RADIAL")

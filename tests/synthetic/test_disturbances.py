@@ -4,9 +4,7 @@ import pytest
 
 from disturbances import CHANGES, DISTURBANCES, Place, View, film_focal_mm, given_camera, object_window
 from slimsfm.geometry import Box, project
-from slimsfm.pose.priors import (
-    with_focal_length,
-)
+from slimsfm.pose.priors import with_focal_length
 
 BOX = Box(np.zeros(3), np.diag([0.4, 0.3, 0.2]))
 CAMERAS = [

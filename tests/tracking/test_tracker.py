@@ -9,9 +9,7 @@ import pytest
 
 from slimsfm.geometry import corner_error
 from slimsfm.localization import Localizer
-from slimsfm.pose.priors import (
-    with_focal_length,
-)
+from slimsfm.pose.priors import with_focal_length
 from slimsfm.tracking import Tracker, TrackerOptions
 
 BLACK = np.zeros((240, 320, 3), np.uint8)

@@ -2,15 +2,8 @@
 
 from slimsfm.localization.batch import MultiLocalizer, localize_images, localize_objects
 from slimsfm.localization.fallback import check_same_frame, localize_failed
-from slimsfm.localization.localizer import (
-    STRATEGIES,
-    LocalizationOptions,
-    Localizer,
-)
-from slimsfm.localization.outcome import (
-    Localization,
-    Seconds,
-)
+from slimsfm.localization.localizer import STRATEGIES, LocalizationOptions, Localizer
+from slimsfm.localization.outcome import Localization, Seconds
 
 __all__ = [
     "STRATEGIES",

@@ -14,12 +14,8 @@ from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.features import Features
 from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import QueryCamera, query_camera
-from slimsfm.localization.localizer import (
-    Localizer,
-)
-from slimsfm.localization.outcome import (
-    Localization,
-)
+from slimsfm.localization.localizer import Localizer
+from slimsfm.localization.outcome import Localization
 from slimsfm.localization.shared_cameras import corrected_cameras, share_cameras
 from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity

@@ -13,9 +13,7 @@ from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import Exif, read_exif
 from slimsfm.localization.map_cameras import camera_by_exif, camera_of_size, scaled_camera, zoomed_camera
 from slimsfm.mapping.map import Map
-from slimsfm.pose.priors import (
-    Gravity,
-)
+from slimsfm.pose.priors import Gravity
 
 FocalLength = Literal["auto", "known", "approximate", "unknown"]
 """How well the focal length of a query is known. If it is not known, it is estimated with the pose. auto: as

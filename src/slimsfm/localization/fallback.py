@@ -10,13 +10,8 @@ import pycolmap
 from slimsfm.errors import InputError
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.localization.batch import localize_images
-from slimsfm.localization.localizer import (
-    Localizer,
-)
-from slimsfm.localization.outcome import (
-    Localization,
-    Seconds,
-)
+from slimsfm.localization.localizer import Localizer
+from slimsfm.localization.outcome import Localization, Seconds
 from slimsfm.mapping.map import Map
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent

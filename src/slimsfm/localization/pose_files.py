@@ -11,9 +11,7 @@ import pycolmap
 
 from slimsfm.errors import OutputError
 from slimsfm.files import replacing
-from slimsfm.localization.outcome import (
-    Localization,
-)
+from slimsfm.localization.outcome import Localization
 from slimsfm.pose import PoseEstimate
 
 Results = Mapping[str, Localization]

@@ -169,8 +169,7 @@ class Search:
             evidence = self._verifier.evidence(shrunk.query, shrunk.matches, pose, used)
             if pose.camera is not None:
                 estimated = shrunk.enlarged(pose.camera)
-            whole = pose.camera and estimated
-            pose = replace(pose, confidence=evidence.confidence, camera=whole)
+            pose = replace(pose, confidence=evidence.confidence, camera=pose.camera and estimated)
         return RoundResult(
             matches=matches,
             pose=pose,

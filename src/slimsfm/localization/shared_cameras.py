@@ -10,13 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from slimsfm.localization.cameras import QueryCamera
-from slimsfm.localization.outcome import (
-    Localization,
-)
+from slimsfm.localization.outcome import Localization
 from slimsfm.localization.search import TRUSTED
-from slimsfm.pose.priors import (
-    with_focal_length,
-)
+from slimsfm.pose.priors import with_focal_length
 
 _SAMPLED = 8  # photos of a camera that its focal length is estimated from
 _LEAST = 3  # of them that must determine it

@@ -25,16 +25,10 @@ from slimsfm.pose.priors import (
     with_two_focal_lengths,
 )
 from slimsfm.pose.ransac import PinholeMatches, RansacOptions
-from slimsfm.pose.refinement import refine_pose
-from slimsfm.pose.types import (
-    MIN_SIGMA_PX,
-    CameraCheck,
-    PoseEstimate,
-    projection_jacobian,
-)
+from slimsfm.pose.refinement import CAUCHY, median_sigma, refine_pose
+from slimsfm.pose.types import MIN_SIGMA_PX, CameraCheck, PoseEstimate, projection_jacobian
 
 _NEAR = 2.5  # times the largest error of an inlier: a right match of a wrong camera may be that far off
-_CAUCHY = 2.385  # scale of the loss in sigmas
 _SHARPEST_PX = 0.3  # smallest sigma that a check assumes
 _DECREASES = {"focal length": 10.0, "principal point": 14.0, "pixel aspect ratio": 13.0}  # that convince
 _CHANGES = {"focal length": 0.03, "principal point": 0.05, "pixel aspect ratio": 0.04}  # beyond autofocus
@@ -121,13 +115,13 @@ def _information(
     seen = matches.focal_px * in_cam[:, :2] / in_cam[:, 2:]
     residuals = seen - matches.pixels
     errors = np.linalg.norm(residuals, axis=1)
-    sigma = max(float(np.median(errors)) / np.sqrt(2 * np.log(2)), _SHARPEST_PX)
+    sigma = max(median_sigma(errors), _SHARPEST_PX)
     jacobian = np.empty((len(seen), 2, UNKNOWNS))
     jacobian[:, :, :FOCAL] = projection_jacobian(in_cam, matches.focal_px)
     jacobian[:, :, FOCAL] = seen
     jacobian[:, :, CENTER] = matches.focal_px * np.eye(2)
     jacobian[:, :, ASPECT] = seen * (0.5, -0.5)
-    weights = 1 / (1 + (errors / (sigma * _CAUCHY)) ** 2)
+    weights = 1 / (1 + (errors / (sigma * CAUCHY)) ** 2)
     rows = jacobian.reshape(-1, UNKNOWNS) / sigma
     weighted = (np.repeat(weights, 2)[:, None] * rows).T
     information = weighted @ rows
@@ -259,8 +253,8 @@ class _CameraSearch:
     def _gain(self, before: PoseEstimate, after: PoseEstimate) -> float:
         """By how much the squared errors decrease, in sigmas of the second pose; each is limited."""
         errors = [np.minimum(self._errors(one), self.options.max_error_px) for one in (before, after)]
-        scatter = np.median(errors[1][after.inliers]) / np.sqrt(2 * np.log(2))
-        return float(np.sum(errors[0] ** 2 - errors[1] ** 2) / max(scatter, MIN_SIGMA_PX) ** 2)
+        sigma_px = max(median_sigma(errors[1][after.inliers]), MIN_SIGMA_PX)
+        return float(np.sum(errors[0] ** 2 - errors[1] ** 2) / sigma_px**2)
 
     def _errors(self, pose: PoseEstimate) -> Float64[np.ndarray, " n"]:
         camera = pose.camera or self.camera

@@ -6,12 +6,7 @@ import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Points2D, Points3D
-from slimsfm.pose.priors import (
-    FocalPrior,
-    Gravity,
-    check_has_focal_length,
-    with_focal_length,
-)
+from slimsfm.pose.priors import FocalPrior, Gravity, check_has_focal_length, with_focal_length
 from slimsfm.pose.ransac import (
     P3P_SAMPLE,
     PinholeMatches,
@@ -22,10 +17,7 @@ from slimsfm.pose.ransac import (
     search_upright,
 )
 from slimsfm.pose.refinement import refine_pose
-from slimsfm.pose.types import (
-    PoseEstimate,
-    pose_covariance,
-)
+from slimsfm.pose.types import PoseEstimate, pose_covariance
 
 _MIN_INLIERS = 4  # of a hypothesis at a focal length that may be wrong
 _MAX_SIGMAS = 4  # by which a pose may deviate from gravity; one in 3000 does

@@ -9,9 +9,7 @@ import pycolmap
 from jaxtyping import Float64, Int64
 
 from slimsfm.arrays import Ids, Points2D, Points3D
-from slimsfm.pose.priors import (
-    Gravity,
-)
+from slimsfm.pose.priors import Gravity
 
 
 def check_matches(points2D: Points2D, points3D_in_world: Points3D) -> None:

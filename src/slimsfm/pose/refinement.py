@@ -9,27 +9,15 @@ from jaxtyping import Bool, Float64
 
 from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.geometry import motions, project, reprojection_errors
-from slimsfm.pose.priors import (
-    FOCAL,
-    UNKNOWNS,
-    FocalPrior,
-    FramePrior,
-    Gravity,
-    Prior,
-    with_focal_length,
-)
+from slimsfm.pose.priors import FOCAL, UNKNOWNS, FocalPrior, FramePrior, Gravity, Prior, with_focal_length
 from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
-from slimsfm.pose.types import (
-    MIN_SIGMA_PX,
-    PoseEstimate,
-    pose_covariance,
-)
+from slimsfm.pose.types import MIN_SIGMA_PX, PoseEstimate, pose_covariance
 
 _ROUNDS = 8  # of choosing inliers; 2 to 4 are common
 _STEPS = 30  # of Levenberg-Marquardt per round; 5 are common
 _NEGLIGIBLE = 1e-6  # decrease of the cost that ends a round: a thousandth of a sigma
 _FARTHEST = 0.5  # change of an intrinsic per step
-_CAUCHY = 2.385  # scale of the loss in sigmas: 95 % efficiency if the errors were normal
+CAUCHY = 2.385  # scale of the loss in sigmas: 95 % efficiency if the errors were normal
 _EXACT_SIGMA_PX = 1e-3  # of exact matches; at zero the priors would weigh nothing
 _MINIMAL = 4  # matches that a pose and a focal length need
 _STEP = 1e-6  # of the numerical derivative of the lens, relative to depth
@@ -217,7 +205,7 @@ class _Problem:
 
     def cost(self, fit: _Fit) -> float:
         squares = (fit.errors(self.pixels, self.in_world) / self.sigma_px) ** 2
-        return float(_CAUCHY**2 * np.log1p(squares / _CAUCHY**2).sum() + _squares(self.priors, fit))
+        return float(CAUCHY**2 * np.log1p(squares / CAUCHY**2).sum() + _squares(self.priors, fit))
 
     def information_and_gradient(
         self, fit: _Fit
@@ -225,7 +213,7 @@ class _Problem:
         seen = project(self.in_world, fit.cam_from_world, fit.camera)
         residuals = (seen - self.pixels) / self.sigma_px
         jacobian = fit.jacobian(self.in_world, seen) / self.sigma_px
-        weights = 1 / (1 + np.sum(residuals**2, axis=1) / _CAUCHY**2)
+        weights = 1 / (1 + np.sum(residuals**2, axis=1) / CAUCHY**2)
         weighted = (weights[:, None, None] * jacobian).reshape(-1, UNKNOWNS)
         information = weighted.T @ jacobian.reshape(-1, UNKNOWNS)
         gradient = weighted.T @ residuals.ravel()
@@ -262,7 +250,12 @@ def _squares(priors: tuple[Prior, ...], fit: _Fit) -> float:
 def _scatter_px(errors: Float64[np.ndarray, " n"]) -> float:
     """Sigma of each coordinate from the median error, corrected for the seven unknowns that were fitted."""
     degrees = 2 * len(errors)
-    return float(np.median(errors) / np.sqrt(2 * np.log(2)) * np.sqrt(degrees / max(degrees - 7, 1)))
+    return float(median_sigma(errors) * np.sqrt(degrees / max(degrees - 7, 1)))
+
+
+def median_sigma(errors: Float64[np.ndarray, " n"]) -> float:
+    """Standard deviation of each coordinate of normal errors in the plane, from their median length."""
+    return float(np.median(errors) / np.sqrt(2 * np.log(2)))
 
 
 def _solve(
