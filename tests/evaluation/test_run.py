@@ -157,8 +157,7 @@ def test_a_run_continues_after_its_process_was_killed(whole, dataset, tmp_path):
     )
     assert killed.returncode == -9, killed.stderr
     done = state_of(folder, "can")
-    (folder / "objects" / ".mug.json.partial").write_text('{"name": "mug", "bo')
-    half = folder / "maps" / "mug" / "sift" / ".points-100.partial"
+    half = folder / "maps" / "mug" / "sift" / ".slimsfm-killed.partial" / "points-100"
     half.mkdir(parents=True)
     (half / "map.json").write_text("{")
     run = run_benchmark(dataset, bench_in(folder))

@@ -1,13 +1,24 @@
 import os
 import shutil
 import subprocess
+import sys
 from contextlib import nullcontext
+from threading import Thread
+from time import sleep
 
 import numpy as np
 import pytest
 
 from slimsfm.errors import OutputError, OutputExistsError
-from slimsfm.files import check_writable, remove, replacing
+from slimsfm.files import (
+    check_writable,
+    read_unchanged,
+    remove,
+    remove_abandoned,
+    renaming,
+    replacing,
+    working_folder,
+)
 from slimsfm.mapping.io import read_map, write_map
 
 
@@ -33,7 +44,8 @@ def test_result_appears_when_the_block_ends_and_not_before(tmp_path, write):
     with replacing(path, overwrite=False) as partial:
         write(partial)
         assert not path.exists()
-        assert partial.parent == path.parent
+        assert partial.name == path.name
+        assert partial.parent.parent == path.parent
     assert content(path) == "new"
     assert list(path.parent.iterdir()) == [path]
 
@@ -87,16 +99,138 @@ def test_existing_output_is_not_overwritten_by_default(tmp_path, old):
     assert content(path) == "old"
 
 
-def test_leftovers_of_a_killed_run_are_removed(tmp_path):
+def test_working_folders_of_killed_processes_are_removed_and_others_kept(tmp_path):
+    code = f"""
+import os, signal
+from pathlib import Path
+from slimsfm.files import replacing
+with replacing({str(tmp_path / "result")!r}, overwrite=False) as partial:
+    partial.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    subprocess.run([sys.executable, "-c", code], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    with working_folder(tmp_path) as used:
+        with replacing(tmp_path / "other", overwrite=False) as partial:
+            write_file(partial)
+        assert sorted(tmp_path.iterdir()) == sorted([used, tmp_path / "other"])
+    assert list(tmp_path.iterdir()) == [tmp_path / "other"]
+
+
+def test_temporary_working_folders_of_killed_processes_are_removed(tmp_path):
+    code = """
+import os, signal
+from slimsfm.files import working_folder
+with working_folder():
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(tmp_path)}, check=False)
+    (tmp_path / ".slimsfm-mine").mkdir()
+    assert len(list(tmp_path.iterdir())) == 2
+    remove_abandoned(tmp_path)
+    assert list(tmp_path.iterdir()) == [tmp_path / ".slimsfm-mine"]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+@pytest.mark.parametrize("old", [None, *WRITERS])
+def test_of_two_writers_the_first_wins_and_the_other_says_so(tmp_path, write, old):
     path = tmp_path / "result"
-    with replacing(path, overwrite=False) as partial:
-        write_folder(partial, "first")
-    write_folder(partial, "remains")
-    write_folder(partial.with_suffix(".old"), "remains")
-    with replacing(path, overwrite=True) as partial:
-        write_folder(partial)
-    assert content(path) == "new"
+    if old:
+        old(path, "old")
+
+    def write_inside_another():
+        with replacing(path, overwrite=True) as second:
+            with replacing(path, overwrite=True) as first:
+                write(first, "first")
+            write(second, "second")
+
+    with pytest.raises(OutputExistsError, match="another process wrote it at the same time"):
+        write_inside_another()
+    assert content(path) == "first"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_is_kept_and_what_it_points_to_is_written(tmp_path, write, exists):
+    target, link = tmp_path / "target", tmp_path / "link"
+    if exists:
+        write(target, "old")
+    link.symlink_to(target)
+    with replacing(link, overwrite=True) as partial:
+        write(partial, "new")
+    assert link.is_symlink()
+    assert content(target) == "new"
+    assert sorted(tmp_path.iterdir()) == [link, target]
+
+
+def test_a_link_in_a_circle_and_a_device_are_refused(tmp_path):
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    with (
+        pytest.raises(OutputError, match="cannot be written"),
+        replacing(tmp_path / "circle", overwrite=True),
+    ):
+        pytest.fail("the block must not run")
+    with pytest.raises(OutputError, match="neither a file nor a folder"):
+        check_writable("/dev/null", overwrite=True)
+
+
+@pytest.mark.parametrize("supported", [True, False], ids=["in one step", "in several"])
+def test_renames_exchange_and_replace_nothing(tmp_path, monkeypatch, supported):
+    if not supported:
+        monkeypatch.setattr(renaming, "_renameat2", lambda *_: False)
+    a, b = tmp_path / "a", tmp_path / "b"
+    write_file(a, "a")
+    write_folder(b, "b")
+    renaming.exchange(a, b)
+    assert (content(a), content(b)) == ("b", "a")
+    with pytest.raises(FileExistsError):
+        renaming.rename_new(a, b)
+    b.unlink()
+    renaming.rename_new(a, b)
+    assert content(b) == "b"
+    with pytest.raises(FileNotFoundError):
+        renaming.exchange(a, b)
+    assert list(tmp_path.iterdir()) == [b]
+
+
+def test_a_folder_that_is_replaced_while_it_is_read_is_read_again(tmp_path):
+    path, versions = tmp_path / "result", iter("bcd")
+    write_folder(path, "a")
+
+    def read():
+        first = content(path)
+        if version := next(versions, None):
+            renaming.exchange(path, new(version))
+        return first + content(path)
+
+    def new(version):
+        write_folder(tmp_path / version, version)
+        return tmp_path / version
+
+    assert read_unchanged(path, read) == "dd"
+
+
+def test_a_writer_waits_for_a_reader(tmp_path):
+    path = tmp_path / "result"
+    write_folder(path, "old")
+    seen = []
+
+    def read():
+        writer.start()
+        for _ in range(20):
+            seen.append(content(path))
+            sleep(0.005)
+
+    def write():
+        with replacing(path, overwrite=True) as partial:
+            write_folder(partial, "new")
+
+    writer = Thread(target=write)
+    read_unchanged(path, read)
+    writer.join()
+    assert set(seen) == {"old"}
+    assert content(path) == "new"
 
 
 def test_block_that_writes_nothing_keeps_the_old_output(tmp_path):

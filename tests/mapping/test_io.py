@@ -9,7 +9,8 @@ import pytest
 
 from scenes import exact_map
 from slimsfm.errors import MapError, OutputError
-from slimsfm.mapping.io import FORMAT_VERSION, bytes_by_part, read_map, write_map
+from slimsfm.mapping.info_file import FORMAT_VERSION
+from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import check_map
 
 
@@ -105,8 +106,10 @@ def test_the_sizes_of_the_parts_sum_to_the_total(written):
     assert sizes["total"] == sum(len(data) for data in files(written).values()) - len("not a part")
 
 
-def change_info(path, change):
+def change_info(path, change=dict.copy):
+    """Change map.json and leave out its checksums, as older maps do."""
     data = json.loads((path / "map.json").read_text())
+    data.pop("checksums", None)
     change(data)
     (path / "map.json").write_text(json.dumps(data))
 
@@ -148,6 +151,9 @@ def test_a_missing_part_is_a_map_error(written, part):
 def test_a_part_cut_short_is_a_map_error(written, part):
     path = written / part
     path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(MapError, match=f"{part}: damaged"):
+        read_map(written)
+    change_info(written)
     with pytest.raises(MapError, match="not a usable map"):
         read_map(written)
 
@@ -160,6 +166,7 @@ def test_a_path_that_is_not_a_map_is_a_map_error(tmp_path):
 
 
 def test_an_image_without_features_is_named(written):
+    change_info(written)
     with h5py.File(written / "features.h5", "r+") as file:
         del file["003.png"]
     with pytest.raises(MapError, match=r"no features of its image '003\.png'"):
@@ -167,6 +174,7 @@ def test_an_image_without_features_is_named(written):
 
 
 def test_more_or_fewer_features_than_keypoints_are_a_map_error(written, exact, tmp_path):
+    change_info(written)
     with h5py.File(written / "features.h5", "r+") as file:
         for part, shape in (("keypoints", (10, 2)), ("descriptors", (32, 10)), ("scores", 10)):
             del file["003.png"][part]
@@ -187,3 +195,30 @@ def test_a_map_needs_images_and_points(exact, tmp_path):
         write_map(empty, tmp_path / "map")
     assert list(tmp_path.iterdir()) == []
     check_map(exact_map(2, 10))
+
+
+def test_a_flipped_bit_is_found_and_its_file_named(written):
+    generator = np.random.default_rng(0)
+    parts = [path for path in written.rglob("*") if path.is_file()]
+    for path in parts * 8:
+        data = path.read_bytes()
+        place, bit = generator.integers(len(data)), generator.integers(8)
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :])
+        if path.name == "map.json" and "checksums" not in path.read_text(errors="replace"):
+            read_map(written)  # an older map, as far as one can tell
+        else:
+            with pytest.raises(MapError, match=path.name):
+                read_map(written)
+        path.write_bytes(data)
+    read_map(written)
+
+
+def test_a_map_without_checksums_opens(written, exact):
+    change_info(written)
+    assert_equal(read_map(written), exact)
+
+
+def test_checksums_do_not_depend_on_how_json_is_written(written, exact):
+    path = written / "map.json"
+    path.write_text(json.dumps(json.loads(path.read_text()), sort_keys=True))
+    assert_equal(read_map(written), exact)

@@ -169,7 +169,9 @@ def _execute(name: str, arguments: Sequence[str]) -> None:
     call = parse(command, name, arguments)
     _take_signal_back()
     from slimsfm.cli.output import quiet
+    from slimsfm.files import remove_abandoned
 
+    remove_abandoned()
     with quiet():
         call()
 

@@ -1,6 +1,5 @@
 """Compare methods, strategies and variants of the map on one object, as in the paper."""
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from slimsfm.evaluation.results import (
 )
 from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
 from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
+from slimsfm.files import working_folder
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.graph.edge_sources import Edges
@@ -145,8 +145,8 @@ def benchmark_object(sequences: ObjectSequences, setup: BenchmarkSetup) -> Objec
         inputs = _variant_inputs(task)
         maps.append(_mapped(method, inputs))
         prepared = prepare_queries(inputs.map, queries, setup.progress)
-        with tempfile.TemporaryDirectory(prefix="slimsfm-benchmark-") as temporary:
-            measurements += _measurements(task, _stored_maps(task, inputs, Path(temporary)), prepared)
+        with working_folder() as temporary:
+            measurements += _measurements(task, _stored_maps(task, inputs, temporary), prepared)
     return ObjectResult(
         name=sequences.name,
         box=sequences.box,
@@ -200,9 +200,9 @@ def _full_map(task: _MethodTask) -> Map:
     """The map of the mapping sequence; built unless an interrupted run has stored it."""
     path, setup = task.map_path("full"), task.setup
     if not path.exists():
-        with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as workspace:
+        with working_folder() as workspace:
             options = setup.build_options(task.method)
-            write_map(map_object(task.sequences, Path(workspace), options, setup.progress), path)
+            write_map(map_object(task.sequences, workspace, options, setup.progress), path)
     return read_map(path)
 
 

@@ -6,8 +6,8 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,7 +23,7 @@ from slimsfm.evaluation.result_files import (
 )
 from slimsfm.evaluation.results import Run, maps_path
 from slimsfm.execution import OpenExecutor, run_tasks
-from slimsfm.files import remove
+from slimsfm.files import locked, remove
 from slimsfm.progress import ProgressBar, silent
 
 _LOGGER = logging.getLogger(__name__)
@@ -66,11 +66,42 @@ def run_benchmark(
         overwrite: Start from scratch if the folder holds a run with other options.
 
     Raises:
-        OutputError: The folder holds a run with other options and `overwrite` is off, or other files.
+        OutputError: The folder holds a run with other options and `overwrite` is off, or other files, or
+            another process is measuring into it.
         InputError: The data set has no object, or the results of a finished object are damaged.
     """
     names = dataset.names()
     _claim(setup.folder, _description(dataset, setup), overwrite=overwrite)
+    with _alone_in(setup.folder):
+        failed = _measure_all(dataset, setup, names, open_executor, progress)
+        if len(list(setup.folder.iterdir())) == 1:  # only run.json: no object was measured
+            remove(setup.folder)
+        return _finished(dataset, setup, [name for name in names if name not in failed], failed)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep other processes from measuring into the folder of a run.
+
+    Raises:
+        OutputError: Another process does.
+    """
+    with locked(folder) as held:
+        if held is False:
+            raise OutputError(
+                f"{folder}: another process is measuring into it; wait, or choose another output"
+            )
+        yield
+
+
+def _measure_all(
+    dataset: Dataset,
+    setup: BenchmarkSetup,
+    names: Sequence[str],
+    open_executor: OpenExecutor | None,
+    progress: ProgressBar,
+) -> dict[str, str]:
+    """Measure the objects that no earlier call has finished; returns the errors of those that failed."""
     todo = [name for name in names if not object_path(setup.folder, name).exists()]
     inner = replace(setup, progress=silent) if open_executor else setup
     tasks = [_Task(dataset=dataset, name=name, setup=inner) for name in todo]
@@ -80,9 +111,7 @@ def run_benchmark(
             index, why = next(results)
             if why:
                 failed[todo[index]] = why
-    if len(list(setup.folder.iterdir())) == 1:  # only run.json: no object was measured
-        remove(setup.folder)
-    return _finished(dataset, setup, [name for name in names if name not in failed], failed)
+    return failed
 
 
 def object_path(folder: Path, name: str) -> Path:
@@ -136,7 +165,8 @@ def _claim(folder: Path, description: dict, *, overwrite: bool) -> None:
             raise OutputError(
                 f"{folder}: holds a run with other options; choose another output or pass `overwrite=True`"
             )
-        remove(folder)
+        with _alone_in(folder):
+            remove(folder)
     write_json(folder / "run.json", description)
 
 

@@ -1,14 +1,21 @@
-"""Atomic writes: a file or folder appears complete or not at all."""
+"""Outputs that appear complete or not at all, whoever else writes or reads them."""
 
+import os
 import shutil
-import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import current_thread, main_thread
-from types import FrameType
+from typing import TypeVar
 
-from slimsfm.errors import OutputError, OutputExistsError
+from slimsfm.errors import InputError, OutputError, OutputExistsError, SlimsfmError
+from slimsfm.files.locks import Identity, identity, locked
+from slimsfm.files.renaming import exchange, rename_new
+from slimsfm.files.working_folders import is_working_folder, remove_abandoned, working_folder
+
+T = TypeVar("T")
+
+_PATIENCE_S = 10.0  # for processes that read what is to be replaced, or replace what is to be read
+_TRIES = 20
 
 
 def check_writable(path: str | Path, *, overwrite: bool) -> None:
@@ -16,13 +23,18 @@ def check_writable(path: str | Path, *, overwrite: bool) -> None:
 
     Raises:
         OutputExistsError: The output exists and `overwrite` is off.
-        OutputError: The parent of the output is not a folder.
+        OutputError: The output is a device, or its parent is not a folder.
     """
     path = Path(path)
     try:
-        if path.exists() and not overwrite:
-            raise OutputExistsError(f"{path}: exists already; choose another output or pass `overwrite=True`")
-        parent = path.absolute().parent
+        if path.exists():
+            if not overwrite:
+                raise OutputExistsError(
+                    f"{path}: exists already; choose another output or pass `overwrite=True`"
+                )
+            if not path.is_file() and not path.is_dir():
+                raise OutputError(f"{path}: is neither a file nor a folder; choose another output")
+        parent = Path(os.path.realpath(path)).parent
         while not parent.exists():
             parent = parent.parent
     except OSError as error:
@@ -33,50 +45,96 @@ def check_writable(path: str | Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def replacing(path: str | Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yield a temporary path next to `path`, and rename it to `path` when the block succeeds.
+    """Yield a temporary path of the same name, which becomes `path` when the block succeeds.
 
     The block writes a file or a folder at the temporary path. If it fails or is interrupted, the temporary
-    output is removed and `path` stays as it was.
+    output is removed and `path` stays as it was. A link is kept, and what it points to is replaced.
 
     Raises:
-        OutputExistsError: The output exists and `overwrite` is off.
+        OutputExistsError: The output exists and `overwrite` is off, or another process wrote it meanwhile.
         OutputError: The output cannot be written, for example because the disk is full or read-only.
     """
     path = Path(path)
     check_writable(path, overwrite=overwrite)
-    partial = path.absolute().parent / f".{path.name}.partial"
+    target = Path(os.path.realpath(path))
     try:
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        remove(partial)
+        before = identity(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(target.parent)
     except OSError as error:
         raise _cannot_write(path, error) from error
     try:
-        yield partial
-        _swap(partial, path)
+        with working_folder(target.parent) as folder:
+            yield folder / target.name
+            _publish(folder / target.name, target, before)
     except OSError as error:
-        if error.filename is not None and not Path(str(error.filename)).absolute().is_relative_to(partial):
+        if error.filename is not None and not _is_part(Path(str(error.filename)).absolute(), target):
             raise  # reading another file failed: the caller reports that
         raise _cannot_write(path, error) from error
-    finally:
-        remove(partial)
+
+
+def _is_part(file: Path, target: Path) -> bool:
+    """Whether a file is an output, or lies in the working folder of one."""
+    if not file.is_relative_to(target.parent) or file == target.parent:
+        return False
+    first = file.relative_to(target.parent).parts[0]
+    return first == target.name or is_working_folder(first)
+
+
+def _publish(new: Path, path: Path, before: Identity | None) -> None:
+    """Put a new output in the place of the one that was there before, unless another has taken it."""
+    with locked(path, wait_s=_PATIENCE_S):
+        now = identity(path)
+        if now not in (before, None):
+            raise _lost(path)
+        if now is None:
+            try:
+                rename_new(new, path)
+            except FileExistsError as error:
+                raise _lost(path) from error
+            return
+        exchange(new, path)
+        if identity(new) != before:
+            exchange(new, path)
+            raise _lost(path)
+
+
+def _lost(path: Path) -> OutputExistsError:
+    return OutputExistsError(
+        f"{path}: another process wrote it at the same time, and its output was kept; choose another output"
+    )
 
 
 def _cannot_write(path: Path, error: OSError) -> OutputError:
     return OutputError(f"{path}: cannot be written ({error.strerror or error}); nothing was kept")
 
 
-def _swap(partial: Path, path: Path) -> None:
-    old = partial.with_suffix(".old")
-    remove(old)
-    try:
-        if path.exists():
-            path.rename(old)
-        partial.rename(path)
-    except BaseException:  # restore the old output after an interruption as well
-        if old.exists() and not path.exists():
-            old.rename(path)
-        raise
-    remove(old)
+def read_unchanged(folder: Path, read: Callable[[], T]) -> T:
+    """Read a folder that other processes may replace, so that all that is read is of one version.
+
+    Args:
+        folder: The folder.
+        read: Reads it and returns what it holds; called again if the folder was replaced meanwhile.
+
+    Raises:
+        InputError: The folder was replaced again and again.
+    """
+    for _ in range(_TRIES):
+        before = identity(folder)
+        with locked(folder, shared=True, wait_s=_PATIENCE_S):
+            if identity(folder) != before:
+                continue
+            try:
+                found = read()
+            except (SlimsfmError, OSError):
+                if identity(folder) == before:
+                    raise
+                continue
+            if identity(folder) == before:
+                return found
+    raise InputError(
+        f"{folder}: other processes replaced it {_TRIES} times while it was read; try again later"
+    )
 
 
 def remove(path: str | Path) -> None:
@@ -86,23 +144,3 @@ def remove(path: str | Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the block ends, because some C code swallows the exceptions."""
-    if current_thread() is not main_thread():
-        yield
-        return
-    delayed: list[tuple[int, FrameType | None]] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    ours = {number: handler for number, handler in handlers.items() if callable(handler)}
-    for number in ours:
-        signal.signal(number, lambda number, frame: delayed.append((number, frame)))
-    try:
-        yield
-    finally:
-        for number, handler in ours.items():
-            signal.signal(number, handler)
-    for number, frame in delayed[:1]:
-        ours[signal.Signals(number)](number, frame)

@@ -1,7 +1,7 @@
 """Computation of a reference graph: in blocks of pairs, in any process, resumed where it was interrupted."""
 
 import os
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from threadpoolctl import threadpool_limits
 
+from slimsfm.errors import OutputExistsError
 from slimsfm.execution import OpenExecutor, run_tasks
-from slimsfm.files import remove
+from slimsfm.files import locked, remove
 from slimsfm.graph.edge_sources import (
     EdgeSource,
     GraphOptions,
@@ -134,9 +135,15 @@ def load_or_compute_graph(
     if not os.access(folder, os.W_OK):
         return compute_graph(map, options, work, progress)
     checkpoint = path.with_suffix(".partial")
-    run = compute_graph(map, options, replace(work, checkpoint=checkpoint), progress)
-    write_graph(path, run.graph, key=key, pairs_tried=run.pairs_tried)
-    remove(checkpoint)
+    with suppress(OSError):  # the checkpoint reports it
+        checkpoint.touch()
+    with locked(checkpoint) as held:
+        if held is False:  # another process computes this graph and will keep it
+            return compute_graph(map, options, work, progress)
+        run = compute_graph(map, options, replace(work, checkpoint=checkpoint), progress)
+        with suppress(OutputExistsError):  # another process was faster
+            write_graph(path, run.graph, key=key, pairs_tried=run.pairs_tried)
+        remove(checkpoint)
     return run
 
 

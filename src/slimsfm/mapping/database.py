@@ -14,7 +14,6 @@ Tables:
 
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from jaxtyping import Float32
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
+from slimsfm.files import working_folder
 
 _MAGIC = b"SQLite format 3\0"
 _JOURNALS = ("-wal", "-journal")  # with what is not yet in the database itself
@@ -70,12 +70,12 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise InputError(f"{path}: not a COLMAP database")
     journals = [journal for end in _JOURNALS if (journal := Path(f"{path}{end}")).is_file()]
-    with tempfile.TemporaryDirectory(prefix="slimsfm-database-") as folder:
+    with working_folder() as folder:
         read = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         if any(journal.stat().st_size for journal in journals):
             for file in (path, *journals):
-                shutil.copyfile(file, Path(folder) / file.name)
-            read = (Path(folder) / path.name).as_uri()
+                shutil.copyfile(file, folder / file.name)
+            read = (folder / path.name).as_uri()
         with closing(sqlite3.connect(read, uri=True)) as database:
             yield database
 

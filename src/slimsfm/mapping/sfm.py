@@ -2,7 +2,6 @@
 
 import logging
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ import pycolmap
 from threadpoolctl import threadpool_limits
 
 from slimsfm.errors import ReconstructionError
+from slimsfm.files import working_folder
 from slimsfm.progress import ProgressBar, counted, silent, single_step
 
 # COLMAP cannot read the photos, because its database names them by numbers; we color points ourselves. After
@@ -31,15 +31,15 @@ def colmap_warnings() -> Iterator[None]:
     """
     log = pycolmap.logging
     before = log.minloglevel, log.alsologtostderr, log.stderrthreshold
-    with tempfile.TemporaryDirectory(prefix="slimsfm-log-") as folder:
-        log.set_log_destination(log.WARNING, Path(folder) / "colmap")
+    with working_folder() as folder:
+        log.set_log_destination(log.WARNING, folder / "colmap")
         log.minloglevel, log.alsologtostderr, log.stderrthreshold = int(log.WARNING), False, int(log.FATAL)
         try:
             yield
         finally:
             log.set_log_destination(log.WARNING, "")
             log.minloglevel, log.alsologtostderr, log.stderrthreshold = before
-            lines = [line for file in Path(folder).iterdir() for line in file.read_text().splitlines()]
+            lines = [line for file in folder.iterdir() for line in file.read_text().splitlines()]
     _pass_on(lines)
 
 
@@ -129,8 +129,8 @@ def map_globally(database: Path, names: list[str], *, seed: int) -> list[pycolma
 
 @contextmanager
 def _scratch() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="slimsfm-sfm-") as folder:
-        yield Path(folder)
+    with working_folder() as folder:
+        yield folder
 
 
 def _named(models: Mapping[int, pycolmap.Reconstruction], names: list[str]) -> list[pycolmap.Reconstruction]:

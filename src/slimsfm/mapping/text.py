@@ -6,13 +6,13 @@ undistorter writes, and spaces in the names of images.
 
 import codecs
 import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from slimsfm.files import working_folder
 from slimsfm.mapping.binary import MODEL_PARTS
 
 _NO_NUMBER = re.compile(r"[-+]?(nan|inf(inity)?)(?=\s|$)", re.IGNORECASE)
@@ -30,10 +30,10 @@ def read_text_model(path: Path) -> pycolmap.Reconstruction:
     else:
         for row in odd:
             lines[row] = _NO_NUMBER.sub(str(_FAR), lines[row])
-        with tempfile.TemporaryDirectory(prefix="slimsfm-model-") as folder:
+        with working_folder() as folder:
             for file in files:
-                (Path(folder) / file.name).write_bytes(file.read_bytes().removeprefix(codecs.BOM_UTF8))
-            (Path(folder) / "images.txt").write_text("\n".join(lines), "utf-8")
+                (folder / file.name).write_bytes(file.read_bytes().removeprefix(codecs.BOM_UTF8))
+            (folder / "images.txt").write_text("\n".join(lines), "utf-8")
             model.read_text(folder)
     for row in _keypoint_rows(lines):
         words = lines[row - 1].split(maxsplit=9)

@@ -1,0 +1,68 @@
+"""Locks between processes, on files and folders that exist.
+
+A lock ends with its process, however that ends. Nobody is kept from a file by it: only processes that ask
+respect it. A replaced file or folder is another one, and has a lock of its own.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+from typing import NamedTuple
+
+_PAUSE_S = 0.002
+
+
+class Identity(NamedTuple):
+    """What tells a file or folder from another one of the same path."""
+
+    device: int
+    inode: int
+
+
+def identity(path: Path) -> Identity | None:
+    """The identity of what is at a path; None if there is nothing."""
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return Identity(found.st_dev, found.st_ino)
+
+
+@contextmanager
+def locked(path: Path, *, shared: bool = False, wait_s: float = 0.0) -> Iterator[bool | None]:
+    """Hold a lock on a file or folder within the context.
+
+    Args:
+        path: An existing file or folder.
+        shared: Whether others may hold it as well, if they share it.
+        wait_s: How long to wait for others, in seconds.
+
+    Yields:
+        Whether the lock is held; None if there is nothing at the path, or its file system has no locks.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        yield None
+        return
+    try:
+        yield _lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, monotonic() + wait_s)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, kind: int, end: float) -> bool | None:
+    while True:
+        try:
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if monotonic() >= end:
+                return False
+            sleep(_PAUSE_S)
+        except OSError:
+            return None
+        else:
+            return True
