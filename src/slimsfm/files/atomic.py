@@ -14,7 +14,7 @@ from slimsfm.files.working_folders import is_working_folder, remove_abandoned, w
 
 T = TypeVar("T")
 
-_PATIENCE_S = 10.0  # for processes that read what is to be replaced, or replace what is to be read
+_PATIENCE_S = 1.0  # for readers of what is to be replaced, who must begin again afterwards
 _TRIES = 20
 
 
