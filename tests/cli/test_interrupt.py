@@ -156,7 +156,7 @@ def test_an_interrupted_comparison_leaves_nothing(boulder, start, tmp_path, comm
         "frontier": ("--uses", "direct", "--json", tmp_path / "f.json", "--curves", tmp_path / "f.svg"),
     }
     process = start(command, boulder.map_path, *outputs[command])
-    wait_until(process, lambda: list((tmp_path / "tmp").glob("slimsfm-weigh-*/map")))
+    wait_until(process, lambda: list((tmp_path / "tmp").glob(".slimsfm-*.partial/map")))
     assert_interrupted(process, how, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["tmp"]
     assert contents(boulder.map_path) == before
@@ -165,6 +165,18 @@ def test_an_interrupted_comparison_leaves_nothing(boulder, start, tmp_path, comm
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_an_interrupted_synthesis_leaves_nothing(start, tmp_path, how):
     process = start("synthesize", "-o", tmp_path / "out", "--objects", "can", "--mapping-frames", 500)
-    wait_until(process, lambda: list(tmp_path.glob("out/.can.partial/can-1/color_full/*.png")))
+    wait_until(process, lambda: list(tmp_path.glob("out/.slimsfm-*.partial/can/can-1/color_full/*.png")))
     assert_interrupted(process, how, tmp_path)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_the_next_command_removes_what_a_killed_one_left(boulder, start, tmp_path):
+    process = start("frontier", boulder.map_path, "--uses", "direct")
+    wait_until(process, lambda: list((tmp_path / "tmp").glob(".slimsfm-*.partial/map")))
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert list((tmp_path / "tmp").iterdir()) != []
+    process = start("info", boulder.map_path)
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, (out, err)
+    assert list((tmp_path / "tmp").iterdir()) == []
