@@ -16,8 +16,8 @@ import pickle
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from traceback import format_exc
@@ -82,29 +82,19 @@ def main() -> None:
             for number, (name, outcome) in enumerate(some, start=1):
                 outcomes.setdefault(subject.kind, []).append(outcome)
                 advance_to(number)
-                if outcome.result in FAILURES and not (outcome.result == "differs" and subject.may_differ):
+                if is_failure(subject, outcome):
                     print(f"{subject.kind}, {name}: {outcome.result}\n{outcome.detail}", flush=True)
     print(table(outcomes))
 
 
-def damaged(subject: Subject, scratch: Path, seed: int, count: int) -> Iterator[tuple[str, Outcome]]:
-    """Damage the files of a subject in turn; yields what was done and what came of it."""
-    shutil.rmtree(scratch, ignore_errors=True)
-    shutil.copytree(subject.folder, scratch)
-    expected = alone(subject.read, scratch)
-    if expected.result != "same":
-        raise RuntimeError(f"{subject.kind}: the undamaged files are not usable: {expected.detail}")
-    whole = {name: (scratch / name).read_bytes() for name in subject.files}
-    each = {name: mutations(data, seed, count) for name, data in whole.items()}
-    for number in range(count):
-        name = subject.files[number % len(subject.files)]
-        what, data = next(each[name])
-        (scratch / name).write_bytes(data)
-        outcome = alone(subject.read, scratch)
-        if outcome.result == "same" and outcome.value != expected.value:
-            outcome = Outcome(result="differs", seconds=outcome.seconds, megabytes=outcome.megabytes)
-        yield f"{name}, {what}", outcome
-        (scratch / name).write_bytes(whole[name])
+def here(read: Read, folder: Path) -> Outcome:
+    """Use a folder in this process."""
+    try:
+        return Outcome(result="same", value=read(folder))
+    except SlimsfmError as error:
+        return Outcome(result="refused", detail=str(error))
+    except Exception:
+        return Outcome(result="traceback", detail=format_exc())
 
 
 def alone(read: Read, folder: Path) -> Outcome:
@@ -115,7 +105,7 @@ def alone(read: Read, folder: Path) -> Outcome:
         signal.alarm(SECONDS)  # its default action ends the process
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         with open(sending, "wb") as pipe:
-            pickle.dump(_tried(read, folder), pipe)
+            pickle.dump(here(read, folder), pipe)
         os._exit(0)
     os.close(sending)
     with open(receiving, "rb") as pipe:
@@ -124,21 +114,43 @@ def alone(read: Read, folder: Path) -> Outcome:
     seconds, megabytes = perf_counter() - start, usage.ru_maxrss / 1000
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
-        result, detail, value = "hung" if number == signal.SIGALRM else "died", f"signal {number}", b""
+        found = Outcome(result="hung" if number == signal.SIGALRM else "died", detail=f"signal {number}")
     else:
-        result, detail, value = pickle.loads(data)
+        found = pickle.loads(data)
     if megabytes > MEGABYTES:
-        result, detail = "memory", f"{megabytes:.0f} MB, {result}: {detail}"
-    return Outcome(result=result, detail=detail, value=value, seconds=seconds, megabytes=megabytes)
+        found = Outcome(result="memory", detail=f"{megabytes:.0f} MB, {found.result}: {found.detail}")
+    return replace(found, seconds=seconds, megabytes=megabytes)
 
 
-def _tried(read: Read, folder: Path) -> tuple[str, str, bytes]:
-    try:
-        return "same", "", read(folder)
-    except SlimsfmError as error:
-        return "refused", str(error), b""
-    except BaseException:
-        return "traceback", format_exc(), b""
+Use = Callable[[Read, Path], Outcome]
+"""Uses a folder, in this process or in another."""
+
+
+def damaged(
+    subject: Subject, scratch: Path, seed: int, count: int, use: Use = alone
+) -> Iterator[tuple[str, Outcome]]:
+    """Damage the files of a subject in turn; yields what was done and what came of it."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    shutil.copytree(subject.folder, scratch)
+    expected = use(subject.read, scratch)
+    if expected.result != "same":
+        raise RuntimeError(f"{subject.kind}: the undamaged files are not usable: {expected.detail}")
+    whole = {name: (scratch / name).read_bytes() for name in subject.files}
+    each = {name: mutations(data, seed, count) for name, data in whole.items()}
+    for number in range(count):
+        name = subject.files[number % len(subject.files)]
+        what, data = next(each[name])
+        (scratch / name).write_bytes(data)
+        outcome = use(subject.read, scratch)
+        if outcome.result == "same" and outcome.value != expected.value:
+            outcome = Outcome(result="differs", seconds=outcome.seconds, megabytes=outcome.megabytes)
+        yield f"{name}, {what}", outcome
+        (scratch / name).write_bytes(whole[name])
+
+
+def is_failure(subject: Subject, outcome: Outcome) -> bool:
+    """Whether an outcome must not be."""
+    return outcome.result in FAILURES and not (outcome.result == "differs" and subject.may_differ)
 
 
 def table(outcomes: dict[str, list[Outcome]]) -> str:

@@ -78,7 +78,7 @@ def subjects(sources: Sources, work: Path) -> Iterator[Subject]:
         yield Subject(kind=f"older {kind}", folder=older, files=_files(older), read=read, may_differ=True)
     results = tuple(name for name in _files(sources.run) if name.endswith(".json") and "maps/" not in name)
     yield Subject(kind="run", folder=sources.run, files=results, read=_reporting, may_differ=True)
-    localizer = Localizer(read_map(sources.slim), LocalizationOptions(min_confidence=0))
+    localizer = Localizer(read_map(sources.slim), LocalizationOptions(min_confidence=0.0))
     for name in _files(sources.photos):
         yield Subject(
             kind="query", folder=sources.photos, files=(name,), read=_judging(localizer, sources.photos, name)
