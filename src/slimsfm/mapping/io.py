@@ -178,9 +178,13 @@ def weigh_map(map: Map) -> int:
 
 def bytes_by_part(path: Path) -> dict[str, int]:
     """Size of each part of a map on disk in bytes, and their `total`."""
-    sizes = {
+    sizes = read_unchanged(path, lambda: _bytes_by_part(path))
+    return {**sizes, "total": sum(sizes.values())}
+
+
+def _bytes_by_part(path: Path) -> dict[str, int]:
+    return {
         part.name: sum(file.stat().st_size for file in [part, *part.rglob("*")] if file.is_file())
         for part in sorted(path.iterdir())
         if part.name in ("sparse", "map.json", *_PARTS)
     }
-    return {**sizes, "total": sum(sizes.values())}
