@@ -11,6 +11,7 @@ from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
+from slimsfm.localization.sight import Sight
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier
 from slimsfm.mapping.map import Map
@@ -102,6 +103,7 @@ class Search:
         self._ransac = ransac
         self._focal: FocalLength = focal
         self._verifier = Verifier(map, strategy, distinct_points(map))
+        self._sight = Sight(map)
 
     def run(self, query: Query, camera: QueryCamera, gravity: Gravity | None = None) -> SearchResult:
         """Localize a query; stop at the first round that suffices."""
@@ -182,7 +184,10 @@ class Search:
     def _estimate(
         self, shrunk: "_Shrunk", source: CameraSource, gravity: Gravity | None
     ) -> PoseEstimate | None:
-        """The pose, with the intrinsics as far as they are believed; those that do not fit are estimated."""
+        """The pose, with the intrinsics as far as they are believed; those that do not fit are estimated.
+
+        None if there is none that the map allows: every result is decided on here.
+        """
         points2D = shrunk.matches.pixels(shrunk.query)
         points3D = self._map.points3D_in_world[shrunk.matches.points]
         focal = self._prior(shrunk.camera, source)
@@ -196,6 +201,8 @@ class Search:
             pose = fit_camera(
                 points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal, gravity=gravity
             )
+        if not self._sight.allows(pose, points3D, pose.camera or shrunk.camera):
+            return None
         inflation = _INFLATION[min(len(pose.estimated), len(_INFLATION) - 1)]
         return replace(pose, covariance=None if pose.covariance is None else inflation**2 * pose.covariance)
 

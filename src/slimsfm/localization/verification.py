@@ -19,6 +19,8 @@ Their weighted sum is the log-odds that the pose is right. The weights come from
 rendered and photographed scenes, whose queries are zoomed, cropped, blurred, dark, hidden, mirrored, or of
 another scene; signs are constrained to the plausible ones. `benchmarks/confidence.py` learns the weights and
 measures the calibration on held-out scenes. A pose that sees the surface from behind is not believed at all.
+No confidence exceeds the probability, by the covariance of the pose, that its corner error is below 0.1: that
+holds even if all of its inliers are right.
 
 This holds on right maps. Next to images that the map's own matches contradict, because the map may be folded
 there, 60 % of the confidence remains.
@@ -96,10 +98,14 @@ class Evidence:
     doubted: bool = False
     """Whether matches contradict the poses of the reference images next to the pose."""
 
+    determined: float = 1.0
+    """Probability that the corner error is below 0.1, if the inliers are right."""
+
     @property
     def confidence(self) -> float:
         """Probability that the pose is right."""
-        on_right_map = float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
+        learned = float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
+        on_right_map = min(learned, self.determined)
         if self.is_behind:
             return on_right_map * _BEHIND
         return on_right_map * (_DOUBTED if self.doubted else 1.0)
@@ -179,6 +185,7 @@ class Verifier:
             cells=_cells(matches.pixels(query)[pose.inliers], camera),
             facing=self._facing(points, pose),
             doubted=self._doubted(pose),
+            determined=pose.probability_within(ADD_FRACTIONS[0], self._box),
         )
 
     def _facing(self, points: Ids, pose: PoseEstimate) -> float:

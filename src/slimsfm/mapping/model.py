@@ -14,10 +14,10 @@ from jaxtyping import Float64
 from slimsfm.arrays import Ids, Points2D, Points3D
 from slimsfm.errors import InputError, ModelError
 from slimsfm.geometry import Box
+from slimsfm.lenses import camera_fault
 from slimsfm.mapping.binary import MODEL_PARTS, check_binary
 from slimsfm.mapping.text import read_text_model
 
-_MOST_PIXELS = 1_000_000  # along a side
 _SHORTEST, _UNIT = 1e-9, 1e-9  # length of a quaternion, and how far from 1 it may be
 _AGAIN = "; export the model again"
 
@@ -76,8 +76,8 @@ def _fault(model: pycolmap.Reconstruction) -> str | None:
                 f"camera {camera_id} is spherical ({camera.model_name}), which is not supported; cut its "
                 "images into perspective ones and reconstruct those"
             )
-        if not _is_camera(camera):
-            return f"camera {camera_id} has an impossible size or focal length{_AGAIN}"
+        if fault := camera_fault(camera):
+            return f"camera {camera_id} is impossible: {fault}; calibrate it or export the model again"
     if not model.is_valid() or _num_track_elements(model) != model.compute_num_observations():
         return f"its points and images do not belong together{_AGAIN}"
     if len({image.name for image in model.images.values()}) < model.num_images():
@@ -91,12 +91,6 @@ def _fault(model: pycolmap.Reconstruction) -> str | None:
         if abs(np.linalg.norm(image.cam_from_world().rotation.quat) - 1) > _UNIT:
             return f"the quaternion of image {image.name!r} or of its rig has no direction{_AGAIN}"
     return None
-
-
-def _is_camera(camera: pycolmap.Camera) -> bool:
-    sizes_are_possible = 0 < camera.width < _MOST_PIXELS and 0 < camera.height < _MOST_PIXELS
-    focal_lengths = camera.params[camera.focal_length_idxs()]
-    return sizes_are_possible and bool(np.isfinite(camera.params).all() and (focal_lengths > 0).all())
 
 
 def _num_track_elements(model: pycolmap.Reconstruction) -> int:
