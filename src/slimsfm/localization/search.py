@@ -13,7 +13,7 @@ from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.sight import Sight
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
-from slimsfm.localization.verification import Evidence, Verifier
+from slimsfm.localization.verification import Evidence, Verifier, inflation
 from slimsfm.mapping.map import Map
 from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
@@ -35,13 +35,6 @@ SETTLED = 0.8
 
 TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
-
-_INFLATION = (1.2, 2.5, 3.5)
-"""Factor of the standard deviations of a pose with no, one, and two intrinsics estimated.
-
-Errors of neighboring points are alike, which matters the more, the finer the differences are that tell the
-intrinsics from the pose. Measured by `benchmarks/confidence.py`.
-"""
 
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
@@ -203,8 +196,8 @@ class Search:
             )
         if not self._sight.allows(pose, points3D, pose.camera or shrunk.camera):
             return None
-        inflation = _INFLATION[min(len(pose.estimated), len(_INFLATION) - 1)]
-        return replace(pose, covariance=None if pose.covariance is None else inflation**2 * pose.covariance)
+        factor = inflation(pose.estimated)
+        return replace(pose, covariance=None if pose.covariance is None else factor**2 * pose.covariance)
 
     def _prior(self, camera: pycolmap.Camera, source: CameraSource) -> FocalPrior | None:
         """What is expected of the focal length; None where it is known."""

@@ -18,8 +18,9 @@ class Sight:
     """How large the references of a map show its points, in the pixels in which features were found."""
 
     def __init__(self, map: Map) -> None:
-        scales = np.array(list(_scales(map)))
-        self._limits = (scales.min() / _FACTOR, scales.max() * _FACTOR) if len(scales) else (0.0, np.inf)
+        scales = list(_scales(map))
+        self._smallest = min(scales, default=0.0) / _FACTOR
+        self._largest = max(scales, default=float("inf")) * _FACTOR
 
     def allows(self, pose: PoseEstimate, points3D_in_world: Points3D, camera: pycolmap.Camera) -> bool:
         """Whether a pose may be right.
@@ -35,8 +36,8 @@ class Sight:
         """
         if not pose.is_possible(points3D_in_world) or (pose.camera and camera_fault(pose.camera)):
             return False
-        low, high = self._limits
-        return low <= _scale(points3D_in_world[pose.inliers], pose.cam_from_world, camera) <= high
+        scale = _scale(points3D_in_world[pose.inliers], pose.cam_from_world, camera)
+        return self._smallest <= scale <= self._largest
 
 
 def _scales(map: Map) -> Iterator[float]:
@@ -59,4 +60,4 @@ def _seen(map: Map, name: str) -> Ids:
 def _scale(points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> float:
     """Pixels per map unit at the points of median distance."""
     distances = np.linalg.norm(cam_from_world * points3D_in_world, axis=1)
-    return camera.mean_focal_length() / max(float(np.median(distances)), np.finfo(np.float64).tiny)
+    return float(camera.mean_focal_length() / max(np.median(distances), np.finfo(np.float64).tiny))
