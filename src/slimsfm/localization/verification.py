@@ -19,10 +19,10 @@ Their weighted sum is the log-odds that the pose is right. The weights come from
 rendered and photographed scenes, whose queries are zoomed, cropped, blurred, dark, hidden, mirrored, or of
 another scene; signs are constrained to the plausible ones. `benchmarks/confidence.py` learns the weights and
 measures the calibration on held-out scenes. A pose that sees the surface from behind is not believed at all.
-No confidence exceeds the probability, by the covariance of the pose, that its corner error is below 0.1 if all
-of its inliers are right. That is of the covariance before its inflation for the 95 % bounds, which most errors
-do not nearly reach; a pose whose predicted error is above 0.1 with the inflation has a confidence of at most
-0.9, and so is never sure.
+No confidence exceeds the probability, by the covariance of the pose, that its corner error is below 0.1 if
+all of its inliers are right. That is of the covariance before its inflation for the 95 % bounds, which most
+errors do not nearly reach; where the predicted error, which includes it, is above 0.1, the confidence is at
+most 0.9, so that the pose is never sure.
 
 This holds on right maps. Next to images that the map's own matches contradict, because the map may be folded
 there, 60 % of the confidence remains.
@@ -71,7 +71,7 @@ def inflation(estimated: tuple[str, ...]) -> float:
     """Factor of the standard deviations of a pose with no, one, and two intrinsics estimated.
 
     Errors of neighboring points are alike, which matters the more, the finer the differences are that tell
-    the intrinsics from the pose. Measured by `benchmarks/confidence.py`, so that bounds hold in 95 % of cases.
+    the intrinsics from the pose. Measured by `benchmarks/confidence.py`: bounds hold in 95 % of cases.
     """
     return _INFLATION[min(len(estimated), len(_INFLATION) - 1)]
 
