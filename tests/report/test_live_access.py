@@ -6,7 +6,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from browsing import browsing, opened, viser
+from browser import open_page
+from browsing import browsing, opened, viser, wait_until
 from slimsfm.errors import InputError
 from slimsfm.report import access
 from slimsfm.report.live import MapWithSize, live_view
@@ -114,3 +115,17 @@ def test_a_viser_that_cannot_be_guarded_is_refused():
 def test_a_page_with_a_token_is_used_as_any_other(full):
     with live_view(MapWithSize(map=full, num_bytes=1), host="0.0.0.0", port=0) as view, browsing(view) as one:
         assert list(one.viewer.frusta) == list(full.images)
+
+
+def test_a_browser_connects_from_the_view_and_not_from_another_page(full, tmp_path):
+    (tmp_path / "foreign.html").write_text("<p>foreign</p>")
+    ask = "new Promise(done => {{ const s = new WebSocket({}); s.onopen = s.onclose = e => done(e.type); }})"
+    with (
+        live_view(MapWithSize(map=full, num_bytes=1), host="0.0.0.0", port=0) as view,
+        open_page(tmp_path / "foreign.html", tmp_path / "profile") as page,
+    ):
+        url = view.address.replace("http", "ws")
+        asked = {"expression": ask.format(f"'{url}'"), "awaitPromise": True, "returnByValue": True}
+        assert page.send("Runtime.evaluate", **asked)["result"]["value"] == "close"
+        page.send("Page.navigate", url=view.address)
+        wait_until(lambda: view.viewers)
