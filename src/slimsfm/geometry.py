@@ -79,10 +79,14 @@ def _hausdorff(a: Points3D, b: Points3D) -> float:
 def project(
     points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
 ) -> Float64[np.ndarray, "n 2"]:
-    """Project points into an image with the camera's distortion; NaN where a point does not project."""
-    return np.asarray(camera.img_from_cam(cam_from_world * points3D_in_world), dtype=np.float64).reshape(
-        -1, 2
-    )
+    """Project points into an image with the camera's distortion; NaN where a point does not project.
+
+    Points that are not in front of the camera do not, whatever the formulas of its model give.
+    """
+    in_cam = cam_from_world * points3D_in_world
+    pixels = np.asarray(camera.img_from_cam(in_cam), dtype=np.float64).reshape(-1, 2)
+    pixels[in_cam[:, 2] <= 0] = np.nan
+    return pixels
 
 
 def reprojection_errors(

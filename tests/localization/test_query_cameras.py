@@ -120,7 +120,7 @@ def test_a_camera_file_of_colmap_is_read(model, tmp_path):
 def test_a_bad_camera_file_is_named(text, tmp_path):
     path = tmp_path / "camera.txt"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"camera\.txt: should hold one line"):
+    with pytest.raises(InputError, match=r"camera\.txt: (should hold one line|the camera is impossible)"):
         read_camera(path)
 
 

@@ -37,7 +37,8 @@ def view(
         focal: How far the queries' focal length is believed, as in localize.
         networks: Where learned methods run.
         port: Port of the view; 0 picks a free one.
-        host: Address of the view: localhost serves this machine only, 0.0.0.0 the whole network.
+        host: Address of the view: localhost serves this machine only, 0.0.0.0 the whole network, to those who
+            have the printed address: it then holds a token.
     """
     try:
         from slimsfm.report.live import LiveQueries, MapWithSize, live_view

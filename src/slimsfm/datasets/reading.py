@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import stored_size
+from slimsfm.lenses import camera_fault
 from slimsfm.photos import Orientation, exif_orientation, opened_image
 
 PIXEL_CENTER = 0.5
@@ -184,7 +185,8 @@ def pinhole_camera(
         source: Origin of the matrix, for messages.
 
     Raises:
-        InputError: The matrix does not describe a pinhole camera; the message names the source.
+        InputError: The matrix does not describe a pinhole camera, or an impossible one; the message names the
+            source.
     """
     (fx, skew, cx), (zero, fy, cy), last = intrinsics
     whole = np.all(np.isfinite(intrinsics)) and fx > 0 and fy > 0
@@ -194,7 +196,10 @@ def pinhole_camera(
             f"got {' '.join(f'{value:g}' for value in intrinsics.ravel())}"
         )
     params = [fx, fy, cx + PIXEL_CENTER, cy + PIXEL_CENTER]
-    return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
+    camera = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
+    if fault := camera_fault(camera):
+        raise InputError(f"{source}: the camera is impossible: {fault}; correct the matrix")
+    return camera
 
 
 def image_size(path: Path, orientation: Orientation = "upright") -> tuple[int, int]:

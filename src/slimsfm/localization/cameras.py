@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import Exif, read_exif
+from slimsfm.lenses import camera_fault
 from slimsfm.localization.map_cameras import camera_by_exif, camera_of_size, scaled_camera, zoomed_camera
 from slimsfm.mapping.map import Map
 from slimsfm.pose.priors import Gravity
@@ -32,7 +33,11 @@ class UnknownIntrinsicsError(ImageError):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class QueryCamera:
-    """The intrinsics of a query, and where they come from."""
+    """The intrinsics of a query, and where they come from.
+
+    Raises:
+        ValueError: The intrinsics are impossible, see `camera_fault`.
+    """
 
     camera: pycolmap.Camera
     """The intrinsics, of the size of the image."""
@@ -43,12 +48,16 @@ class QueryCamera:
     notes: tuple[str, ...] = ()
     """Sentences that name the image, on what was ignored, such as an impossible focal length in EXIF."""
 
+    def __post_init__(self) -> None:
+        if fault := camera_fault(self.camera):
+            raise ValueError(f"camera must be possible, but {fault}")
+
 
 def read_camera(path: str | Path) -> pycolmap.Camera:
     """Read the one camera of a file in COLMAP's `cameras.txt` format: `ID MODEL WIDTH HEIGHT PARAMS...`.
 
     Raises:
-        InputError: The file is missing, or does not hold exactly one camera.
+        InputError: The file is missing, does not hold exactly one camera, or an impossible one.
     """
     path = Path(path)
     try:
@@ -61,20 +70,13 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
         camera_id, model, width, height, *params = camera
         read = pycolmap.Camera.create_from_model_name(int(camera_id), model, 1.0, int(width), int(height))
         read.params = [float(p) for p in params]
-        if _is_usable(read):
-            return read
-        raise ValueError("not this model's parameters")
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise InputError(
             f"{path}: should hold one line `ID MODEL WIDTH HEIGHT PARAMS...` as in COLMAP's cameras.txt"
         ) from error
-
-
-def _is_usable(camera: pycolmap.Camera) -> bool:
-    if not camera.verify_params() or min(camera.width, camera.height) < 1:
-        return False
-    focal_lengths = camera.params[camera.focal_length_idxs()]
-    return bool(np.all(np.isfinite(camera.params)) and len(focal_lengths) and np.all(focal_lengths > 0))
+    if fault := camera_fault(read):
+        raise InputError(f"{path}: the camera is impossible: {fault}; correct the line or calibrate it again")
+    return read
 
 
 def guess_camera(width: int, height: int) -> pycolmap.Camera:
@@ -186,7 +188,7 @@ def _by_exif(exif: Exif, size: tuple[int, int]) -> pycolmap.Camera | None:
         return None
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal_px, *size)
     camera.has_prior_focal_length = True
-    return camera
+    return None if camera_fault(camera) else camera
 
 
 def _notes(path: Path, exif: Exif) -> tuple[str, ...]:

@@ -11,8 +11,9 @@ from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
+from slimsfm.localization.sight import Sight
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
-from slimsfm.localization.verification import Evidence, Verifier
+from slimsfm.localization.verification import Evidence, Verifier, inflation
 from slimsfm.mapping.map import Map
 from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
@@ -34,13 +35,6 @@ SETTLED = 0.8
 
 TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
-
-_INFLATION = (1.2, 2.5, 3.5)
-"""Factor of the standard deviations of a pose with no, one, and two intrinsics estimated.
-
-Errors of neighboring points are alike, which matters the more, the finer the differences are that tell the
-intrinsics from the pose. Measured by `benchmarks/confidence.py`.
-"""
 
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
@@ -102,6 +96,7 @@ class Search:
         self._ransac = ransac
         self._focal: FocalLength = focal
         self._verifier = Verifier(map, strategy, distinct_points(map))
+        self._sight = Sight(map)
 
     def run(self, query: Query, camera: QueryCamera, gravity: Gravity | None = None) -> SearchResult:
         """Localize a query; stop at the first round that suffices."""
@@ -182,7 +177,10 @@ class Search:
     def _estimate(
         self, shrunk: "_Shrunk", source: CameraSource, gravity: Gravity | None
     ) -> PoseEstimate | None:
-        """The pose, with the intrinsics as far as they are believed; those that do not fit are estimated."""
+        """The pose, with the intrinsics as far as they are believed; those that do not fit are estimated.
+
+        None if there is none that the map allows: every result is decided on here.
+        """
         points2D = shrunk.matches.pixels(shrunk.query)
         points3D = self._map.points3D_in_world[shrunk.matches.points]
         focal = self._prior(shrunk.camera, source)
@@ -196,8 +194,10 @@ class Search:
             pose = fit_camera(
                 points2D, points3D, pose, shrunk.camera, self._ransac, focal=focal, gravity=gravity
             )
-        inflation = _INFLATION[min(len(pose.estimated), len(_INFLATION) - 1)]
-        return replace(pose, covariance=None if pose.covariance is None else inflation**2 * pose.covariance)
+        if not self._sight.allows(pose, points3D, pose.camera or shrunk.camera):
+            return None
+        factor = inflation(pose.estimated)
+        return replace(pose, covariance=None if pose.covariance is None else factor**2 * pose.covariance)
 
     def _prior(self, camera: pycolmap.Camera, source: CameraSource) -> FocalPrior | None:
         """What is expected of the focal length; None where it is known."""

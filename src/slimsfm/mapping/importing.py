@@ -80,6 +80,9 @@ class ImportOptions:
         return [*(path for path in given if path), *found]
 
 
+_FARTHEST_PX = 1e9  # coordinate of a keypoint; beyond, it is no position
+
+
 def import_colmap(
     model_path: str | Path,
     images: str | Path | None = None,
@@ -187,7 +190,7 @@ def _drop_unplaced(model: pycolmap.Reconstruction, images: list[pycolmap.Image])
     """
     unusable, observations = {}, 0
     for image in images:
-        unusable[image.name] = ~np.isfinite(positions(image)).all(axis=1)
+        unusable[image.name] = ~(np.abs(positions(image)) < _FARTHEST_PX).all(axis=1)
         for row in np.flatnonzero(unusable[image.name]).tolist():
             if image.points2D[row].has_point3D():
                 model.delete_observation(image.image_id, row)

@@ -16,7 +16,9 @@ from slimsfm.errors import MapError
 from slimsfm.features import Features, NearestOptions, shrink_factor
 from slimsfm.features.registry import descriptor_metric_of, finds_keypoints
 from slimsfm.geometry import Box
+from slimsfm.lenses import camera_fault
 from slimsfm.mapping.cameras import MapCamera, distinct_cameras
+from slimsfm.mapping.extent import box_fault, distance_fault, extent_fault
 from slimsfm.mapping.info import MapInfo
 
 MapKind = Literal["full", "images", "points", "images and points"]
@@ -228,20 +230,35 @@ def observed(map: Map) -> csr_array:
 
 
 def check_map(map: Map) -> None:
-    """Check that the parts of a map belong together.
+    """Check that the parts of a map belong together, and that it may be of a real place.
 
     Raises:
-        MapError: The map has no reference image or no point, or lacks the features of an image.
+        MapError: The map has no reference image or no point, or lacks the features of an image; a camera is
+            impossible, or points, cameras and box have no extent or are too far away.
     """
     if not map.images or not len(map.point3D_ids):
         raise MapError(
             f"the map has {len(map.images)} images and {len(map.point3D_ids)} points; it needs both"
         )
+    if fault := _fault(map):
+        raise MapError(f"the map cannot be right: {fault}; build or import it again")
     if map.is_for_direct_matching:
         return
     for name in map.images:
         if name not in map.features:
             raise MapError(f"the map has no features of its image {name!r}")
+
+
+def _fault(map: Map) -> str | None:
+    for camera_id in sorted({image.camera_id for image in map.images.values()}):
+        if fault := camera_fault(map.model.camera(camera_id)):
+            return f"camera {camera_id} is impossible: {fault}"
+    cameras = np.array([image.cam_from_world().translation for image in map.images.values()])
+    return (
+        distance_fault("cameras", cameras)
+        or extent_fault("points", map.points3D_in_world)
+        or box_fault(map.box, map.points3D_in_world)
+    )
 
 
 def check_has_features(map: Map) -> None:

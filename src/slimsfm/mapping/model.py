@@ -14,10 +14,11 @@ from jaxtyping import Float64
 from slimsfm.arrays import Ids, Points2D, Points3D
 from slimsfm.errors import InputError, ModelError
 from slimsfm.geometry import Box
+from slimsfm.lenses import camera_fault
 from slimsfm.mapping.binary import MODEL_PARTS, check_binary
+from slimsfm.mapping.extent import distance_fault, extent_fault
 from slimsfm.mapping.text import read_text_model
 
-_MOST_PIXELS = 1_000_000  # along a side
 _SHORTEST, _UNIT = 1e-9, 1e-9  # length of a quaternion, and how far from 1 it may be
 _AGAIN = "; export the model again"
 
@@ -70,33 +71,36 @@ def _fault(model: pycolmap.Reconstruction) -> str | None:
     """The first fault found in a model that pycolmap could read, or None."""
     if not model.num_reg_images():
         return "the model has no image with a pose; give a model with poses"
-    for camera_id, camera in sorted(model.cameras.items()):
-        if camera.is_spherical():
-            return (
-                f"camera {camera_id} is spherical ({camera.model_name}), which is not supported; cut its "
-                "images into perspective ones and reconstruct those"
-            )
-        if not _is_camera(camera):
-            return f"camera {camera_id} has an impossible size or focal length{_AGAIN}"
+    if fault := _camera_fault(model):
+        return fault
     if not model.is_valid() or _num_track_elements(model) != model.compute_num_observations():
         return f"its points and images do not belong together{_AGAIN}"
     if len({image.name for image in model.images.values()}) < model.num_images():
         return f"several of its images have the same name{_AGAIN}"
     images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     poses = [image.cam_from_world().matrix() for image in images]
-    positions = np.array([point.xyz for point in model.points3D.values()])
+    positions = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
     if not np.isfinite(poses).all() or not np.isfinite(positions).all():
         return f"a pose or a point in it is not finite{_AGAIN}"
+    cameras = np.array([pose[:, 3] for pose in poses])
+    if fault := distance_fault("cameras", cameras) or extent_fault("points", positions):
+        return f"{fault}{_AGAIN}"
     for image in images:
         if abs(np.linalg.norm(image.cam_from_world().rotation.quat) - 1) > _UNIT:
             return f"the quaternion of image {image.name!r} or of its rig has no direction{_AGAIN}"
     return None
 
 
-def _is_camera(camera: pycolmap.Camera) -> bool:
-    sizes_are_possible = 0 < camera.width < _MOST_PIXELS and 0 < camera.height < _MOST_PIXELS
-    focal_lengths = camera.params[camera.focal_length_idxs()]
-    return sizes_are_possible and bool(np.isfinite(camera.params).all() and (focal_lengths > 0).all())
+def _camera_fault(model: pycolmap.Reconstruction) -> str | None:
+    for camera_id, camera in sorted(model.cameras.items()):
+        if camera.is_spherical():
+            return (
+                f"camera {camera_id} is spherical ({camera.model_name}), which is not supported; cut its "
+                "images into perspective ones and reconstruct those"
+            )
+        if fault := camera_fault(camera):
+            return f"camera {camera_id} is impossible: {fault}; calibrate it or export the model again"
+    return None
 
 
 def _num_track_elements(model: pycolmap.Reconstruction) -> int:

@@ -10,6 +10,7 @@ import pycolmap
 from slimsfm.arrays import Image
 from slimsfm.features import Extractor, Features
 from slimsfm.geometry import Box
+from slimsfm.lenses import camera_fault
 from slimsfm.mapping.choice import PickedModel
 from slimsfm.mapping.extraction import CameraSharing
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
@@ -86,6 +87,11 @@ class KnownPoses:
 
     unit: str
     """Unit of the world frame, such as "metre"."""
+
+    def __post_init__(self) -> None:
+        for name, camera in self.cameras.items():
+            if fault := camera_fault(camera):
+                raise ValueError(f"cameras must be possible, but that of {name!r} is not: {fault}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -198,8 +198,9 @@ class FramePrior:
 
     def rows(self, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> PriorRows:  # noqa: ARG002
         """Deviations of the principal point and of the logarithm of the aspect ratio."""
-        at, sigmas = camera.principal_point_idxs(), np.array([*2 * (self.center_sigma,), _STRETCHED])
-        center = (camera.params[at] - self.camera.params[at]) / camera.mean_focal_length()
+        sigmas = np.array([*2 * (self.center_sigma,), _STRETCHED])
+        now, expected = (one.params[one.principal_point_idxs()] for one in (camera, self.camera))
+        center = (now - expected) / camera.mean_focal_length()
         changes = np.array([*center, log_aspect(camera) - log_aspect(self.camera)])
         free = [self.center, self.center, self.aspect]
         jacobian = np.eye(UNKNOWNS)[CENTER.start :] / sigmas[:, None]

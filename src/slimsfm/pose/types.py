@@ -1,6 +1,7 @@
 """A pose estimate, its uncertainty, and what its matches say about the camera."""
 
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 import pycolmap
@@ -82,16 +83,43 @@ class PoseEstimate:
             return None
         return float(min(np.degrees(bound_95(self.covariance[:3, :3])), 180.0))
 
+    def is_possible(self, points3D_in_world: Points3D) -> bool:
+        """Whether all of its numbers are finite and its inliers are in front of the camera.
+
+        Args:
+            points3D_in_world: The points of the matches that it was estimated from.
+        """
+        camera = () if self.camera is None else self.camera.params
+        numbers = [
+            self.cam_from_world.matrix().ravel(),
+            camera,
+            *(() if self.covariance is None else self.covariance),
+        ]
+        depths = (self.cam_from_world * points3D_in_world[self.inliers])[:, 2]
+        return bool(np.isfinite(np.concatenate(numbers)).all() and (depths > 0).all())
+
+    def probability_within(self, fraction: float, box: Box) -> float:
+        """Probability that the corner error is below a fraction of the diagonal, if the inliers are right.
+
+        Raises:
+            ValueError: The pose has no covariance.
+        """
+        return probability_below(fraction * box.diagonal, self._corner_covariance(box))
+
     def corner_bound(self, box: Box) -> float:
         """Relative corner error that the pose does not exceed with 95 % probability.
 
         Raises:
             ValueError: The pose has no covariance.
         """
+        return bound_95(self._corner_covariance(box)) / box.diagonal
+
+    def _corner_covariance(self, box: Box) -> Float64[np.ndarray, "24 24"]:
+        """Covariance of the displacements of all corners, over the root of their number."""
         if self.covariance is None:
             raise ValueError("covariance must not be None to bound an error; estimate_pose computes it")
         moved = motions(self.cam_from_world * box.corners).reshape(24, 6) / np.sqrt(8)
-        return bound_95(moved @ self.covariance @ moved.T) / box.diagonal
+        return moved @ self.covariance @ moved.T
 
     def predicted_corner_error(self, box: Box) -> float:
         """Predict the relative corner error, assuming that the inliers are correct.
@@ -116,11 +144,22 @@ def bound_95(covariance: Float64[np.ndarray, "k k"]) -> float:
     The squared length is taken for a multiple of a chi-squared variable of the same mean and variance, whose
     quantile is that of Wilson and Hilferty; within 2 % of the exact one.
     """
-    mean, square = np.trace(covariance), np.sum(covariance * covariance.T)
+    mean, part = _squared_length(covariance)
+    return float(np.sqrt(mean) * (1 - part + _NORMAL_95 * np.sqrt(part)) ** 1.5) if mean > 0 else 0.0
+
+
+def probability_below(length: float, covariance: Float64[np.ndarray, "k k"]) -> float:
+    """Probability that a normally distributed vector of mean zero is shorter than `length`, as `bound_95`."""
+    mean, part = _squared_length(covariance)
     if not mean > 0:
-        return 0.0
-    part = 2 * square / (9 * mean**2)  # 2 / 9 over the degrees of freedom
-    return float(np.sqrt(mean) * (1 - part + _NORMAL_95 * np.sqrt(part)) ** 1.5)
+        return 1.0
+    return NormalDist(1 - part, part**0.5).cdf((length**2 / mean) ** (1 / 3))
+
+
+def _squared_length(covariance: Float64[np.ndarray, "k k"]) -> tuple[float, float]:
+    """Mean of the squared length of a normal vector, and 2 / 9 over its degrees of freedom."""
+    mean, square = np.trace(covariance), np.sum(covariance * covariance.T)
+    return (float(mean), float(2 * square / (9 * mean**2))) if mean > 0 else (0.0, 0.0)
 
 
 def rms_corner_errors(

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from slimsfm.domination import Solution
 from slimsfm.errors import InputError
+from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions, ReferenceGraph
 from slimsfm.graph.edge_sources import Edges
 from slimsfm.graph.io import read_given_graph
@@ -223,7 +224,8 @@ def reduce(
 
     Raises:
         InputError: Options contradict each other or the map, the map has fewer than two images, or no choice
-            meets the limits; the nearest choice is named.
+            meets the limits; the nearest choice is named. Or what would be kept is predicted to localize no
+            query.
         MapError: The map has no features.
     """
     check_reducible(map)
@@ -246,7 +248,23 @@ def reduce(
         found = frontier(map, tried, graph=graph, limits=options.limits, progress=progress)
         taken = {use: recommend(found, use, options.limits) for use in left}
         reduced = replace(reduced, forecast={**reduced.forecast, **taken})
+    for use, one in reduced.forecast.items():
+        _check_localizes(use, one)
     return replace(reduced, map=_kept(map, reduced.forecast))
+
+
+def _check_localizes(use: str, one: Candidate) -> None:
+    tests, is_full_useless = len(one.prediction.tests), not one.full.within(ADD_FRACTIONS[0])
+    if not tests or one.prediction.within(ADD_FRACTIONS[0]):
+        return
+    raise InputError(
+        f"the reduced map would localize nothing: of {tests} images left out, its {use} localize none"
+        + (
+            ", nor does the full map; check it, or build it again with more photos"
+            if is_full_useless
+            else "; allow it more points or images"
+        )
+    )
 
 
 def _for_map(options: ReduceOptions, map: Map) -> ReduceOptions:

@@ -24,6 +24,7 @@ from slimsfm.localization.cameras import FocalLength, query_camera
 from slimsfm.mapping.map import Map
 from slimsfm.photos import Orientation, read_image, shrink
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.report.access import Access, serving
 from slimsfm.report.live_panel import AFTER, BEFORE, MAX_PHOTO_PX, ViewerPanel
 from slimsfm.report.scene3d import Scene3D, build_scene3d
 
@@ -84,6 +85,7 @@ def live_view(
         reduced: A map that was reduced from it.
         queries: Images to localize.
         host: Address or name that browsers connect to; 0.0.0.0 serves on all addresses of this machine.
+            Beyond this machine, `LiveView.address` holds a token, without which nobody can connect.
         port: Port of the host; 0 picks a free one.
 
     Raises:
@@ -92,13 +94,14 @@ def live_view(
     if reduced:
         check_same_frame(full.map, reduced.map)
     address = _free_address(host, port)
+    access = Access.to(address)
     # viser prints when it starts and stops
-    with redirect_stdout(StringIO()):
+    with redirect_stdout(StringIO()), serving(access):
         server = viser.ViserServer(host=address, port=port, label="slimsfm", verbose=False)
     try:
         if port not in (0, server.get_port()):  # viser falls back to the next port
             raise InputError(f"port {port} is in use; choose another port")
-        view = LiveView(server, full, reduced, queries)
+        view = LiveView(server, full, reduced, queries, token=access.token)
         try:
             yield view
         finally:
@@ -157,8 +160,11 @@ class LiveView:
         full: MapWithSize,
         reduced: MapWithSize | None = None,
         queries: LiveQueries | None = None,
+        *,
+        token: str = "",
     ) -> None:
         self.server = server
+        self._token = token
         self.maps = {BEFORE: full, **({AFTER: reduced} if reduced else {})}
         self.scene: Scene3D = build_scene3d(full.map)
         self.queries = queries
@@ -174,9 +180,10 @@ class LiveView:
 
     @property
     def address(self) -> str:
-        """URL for a browser."""
+        """URL for a browser, with the token if it needs one."""
         host = self.server.get_host().replace("0.0.0.0", "localhost")
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+        path = f"/{self._token}/" if self._token else ""
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}{path}"
 
     def show_photos(self, folder: Path, progress: ProgressBar = silent) -> int:
         """Show the reference photos in their frusta.

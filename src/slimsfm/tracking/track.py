@@ -108,7 +108,7 @@ def _accepted(track: Track, box: Box) -> Track | None:
     """The track without outliers; None unless enough points agree and determine the pose."""
     seen, agree = track.seen, track.pose.inliers
     enough = max(_MIN_POINTS, _MIN_SHARE * seen.num_expected, len(agree) / 2)
-    if agree.sum() < enough or track.pose.predicted_corner_error(box) > MAX_CORNER_ERROR:
+    if agree.sum() < enough or not track.pose.predicted_corner_error(box) <= MAX_CORNER_ERROR:
         return None
     inliers = FoundTemplates(
         rows=seen.rows[agree], points2D=seen.points2D[agree], num_expected=seen.num_expected
