@@ -113,8 +113,8 @@ def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
 def load_arrays(path: Path) -> dict[str, Array] | None:
     """Read arrays in the order in which they were written; None if the file is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
