@@ -14,6 +14,7 @@ from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup
 from slimsfm.evaluation.comparison import compare_runs
 from slimsfm.evaluation.result_files import digest_of, read_run, write_results
 from slimsfm.evaluation.run import run_benchmark
+from slimsfm.files.space import check_place
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.progress import shown
 
@@ -47,6 +48,7 @@ def benchmark(
     networks.apply()
     if (build.extractor, build.matcher) != (BuildOptions().extractor, BuildOptions().matcher):
         raise InputError("build.extractor and build.matcher are ignored; use `methods=EXTRACTOR+MATCHER`")
+    check_place(output)
     setup = BenchmarkSetup(folder=output, options=comparison, build=build, progress=shown)
     with resumable():
         run = run_benchmark(dataset, setup, execution.open_executor(), shown, overwrite=overwrite)

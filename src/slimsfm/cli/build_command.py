@@ -8,6 +8,7 @@ from slimsfm.cli.output import Stopwatch, check_output, console, finish_map, plu
 from slimsfm.files.work_folder import work_folder
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
+from slimsfm.mapping.space import bytes_to_build
 from slimsfm.progress import shown
 
 
@@ -32,7 +33,8 @@ def build_photos(
     """
     watch = Stopwatch()
     networks.apply()
-    check_output(output, images, build.masks, build.box, overwrite=overwrite)
+    needed = bytes_to_build(images, build)
+    check_output(output, images, build.masks, build.box, overwrite=overwrite, least_bytes=needed)
     with work_folder(output) as workspace:
         made = build_map(images, build, workspace=workspace, progress=shown)
         write_map(made, output, overwrite=overwrite)
