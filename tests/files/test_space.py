@@ -51,7 +51,5 @@ def test_what_is_tried_leaves_nothing_and_needs_no_folder(tmp_path):
 
 
 def test_too_little_room_is_said_with_numbers(tmp_path):
-    with pytest.raises(
-        OutputError, match=r"map: No space left on device: .* MB are free, about 1e"
-    ):
+    with pytest.raises(OutputError, match=r"map: No space left on device: .* MB are free, about 1e"):
         check_place(tmp_path / "map", least_bytes=10**18)

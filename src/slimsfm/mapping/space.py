@@ -8,11 +8,12 @@ from slimsfm.mapping.work import BuildOptions
 
 _FEATURE = 150  # bytes of a SIFT feature in features.h5; learned features take more
 _FEATURES = 2048  # of a photo, where nothing else is asked for
+_COPIES = 2  # features as they are extracted, and in the map or COLMAP's database
 _IN_MODEL = 24  # bytes of a keypoint in images.bin
 
 
 def bytes_to_build(images: Path, options: BuildOptions) -> int:
-    """Bytes of the features of a folder of photos, of which a build keeps at least one copy.
+    """Bytes of the features of a folder of photos, in the files of a build that hold a copy of them.
 
     A photo is taken to have no more bytes of features than its file has. 0 if there is no photo.
     """
@@ -21,7 +22,7 @@ def bytes_to_build(images: Path, options: BuildOptions) -> int:
     except InputError:
         return 0
     most = _FEATURE * (options.max_features or _FEATURES)
-    return sum(min(most, (images / name).stat().st_size) for name in names)
+    return _COPIES * sum(min(most, (images / name).stat().st_size) for name in names)
 
 
 def bytes_to_import(model: Path) -> int:
