@@ -64,7 +64,9 @@ def benchmark(
         raise InputError(f"{name}: {why} ({count} could not be measured; fix this and run the command again)")
     objects = plural(len(run.objects), "object")
     queries = plural(sum(len(one.queries) for one in run.objects), "query", "queries")
-    what = f"{output}: {objects}, {queries}, digest {digest_of(run.objects)}"
+    skipped = sum(len(one.skipped) for one in run.objects)
+    left_out = f" ({skipped} skipped)" if skipped else ""
+    what = f"{output}: {objects}, {queries}{left_out}, digest {digest_of(run.objects)}"
     finish(what, watch, "report", output, "-o", "report.html")
 
 
