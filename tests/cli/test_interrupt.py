@@ -9,11 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from commands import contents, messages, slimsfm
 from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
+from slimsfm.synthetic.scene import mapping_take
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to see work begin")
 PATIENCE_S = 60
@@ -81,13 +83,46 @@ def assert_interrupted(process, how, tmp_path, what_now="no incomplete output wa
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
-@pytest.mark.parametrize("stage", ["features.h5", "database.db"])
-def test_an_interrupted_build_leaves_nothing(boulder, start, tmp_path, how, stage):
-    process = start("build", boulder.photos, "-o", tmp_path / "out" / "map")
-    wait_until(process, lambda: list((tmp_path / "tmp").glob(f"slimsfm-build-*/{stage}")))
-    assert_interrupted(process, how, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["tmp"]
+def stopped(process, how, tmp_path):
+    """Stop a build; only its work is left."""
+    if how != signal.SIGKILL:
+        assert_interrupted(process, how, tmp_path, GOES_ON)
+    process.kill()
+    process.communicate()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".map.build", "tmp"]
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """Eight photos, and the files of the map that they give without interruption."""
+    folder, take = tmp_path_factory.mktemp("few"), mapping_take("printed_box", 80, 320, 240, 0)
+    (folder / "photos").mkdir()
+    for i in range(8):
+        Image.fromarray(take.frame(i)).save(folder / "photos" / f"{i}.png", compress_level=1)
+    assert slimsfm("build", folder / "photos", "-o", folder / "map").code == 0
+    return folder / "photos", contents(folder / "map")
+
+
+@pytest.mark.parametrize(
+    ("how", "stage"),
+    [
+        (signal.SIGKILL, "extracted/*.npz"),
+        (signal.SIGTERM, "extracted/*.npz"),
+        (signal.SIGKILL, "database.images"),
+    ],
+)
+def test_the_same_command_goes_on_with_a_build_that_was_stopped(few, start, tmp_path, how, stage):
+    photos, whole = few
+    command, work = ("build", photos, "-o", tmp_path / "map"), tmp_path / ".map.build"
+    process = start(*command)
+    wait_until(process, lambda: list(work.glob(stage)))
+    stopped(process, how, tmp_path)
+    count = len(list(work.glob("extracted/*.npz")))
+    again = slimsfm("build", photos, "-o", tmp_path / "map")
+    assert again.code == 0
+    assert contents(tmp_path / "map") == whole
+    assert not work.exists()
+    assert count > 0
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -45,6 +46,17 @@ def refused(tmp_path):
         assert contents(tmp_path) == before
 
     return check
+
+
+def write_mjpeg(path, images):
+    """A film whose files can be joined."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", 25)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuvj420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
 
 
 def poses_of(path):
@@ -240,15 +252,17 @@ def test_bad_videos(refused, boulder, video, tmp_path):
     refused(boulder.map_path, 97, *arguments, naming="97: no camera")
 
 
-def test_a_folder_with_a_broken_or_a_larger_image(refused, boulder, images, tmp_path):
+def test_a_folder_with_a_broken_or_a_larger_image_is_refused_if_strict(refused, boulder, images, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
     Image.fromarray(images[0]).save(folder / "0.png")
     (folder / "1.png").write_text("no image")
-    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "drawn.mp4")
+    arguments = ("-o", tmp_path / "poses.json", "--video", tmp_path / "drawn.mp4", "--strict")
     refused(boulder.map_path, folder, *arguments, naming=folder / "1.png")
     Image.new("RGB", (640, 480)).save(folder / "1.png")
-    refused(boulder.map_path, folder, *arguments, naming="1.png has 640x480 pixels, the first 320x240")
+    refused(
+        boulder.map_path, folder, *arguments, naming="1.png: has 640x480 pixels, the frames before 320x240"
+    )
 
 
 def test_bad_maps_outputs_and_options(refused, boulder, video, tmp_path):
@@ -298,3 +312,41 @@ def test_outputs_that_exist_or_are_the_input(refused, boulder, video, tmp_path):
     refused(
         boulder.map_path, film, "-o", tmp_path / "poses.json", "--video", film, "--overwrite", naming=film
     )
+
+
+def test_images_that_cannot_be_used_are_skipped_and_the_others_do_not_notice(boulder, images, tmp_path):
+    folder, good = tmp_path / "frames", tmp_path / "good"
+    for i, image in enumerate(images[:3]):
+        for parent in (folder, good):
+            parent.mkdir(exist_ok=True)
+            Image.fromarray(image).save(parent / f"{2 * i}.png")
+    (folder / "1.png").write_bytes((folder / "0.png").read_bytes()[:5000])
+    Image.fromarray(images[0][:100]).save(folder / "3.png")
+    alone = slimsfm("track", boulder.map_path, good, "-o", tmp_path / "good.json")
+    done = slimsfm("track", boulder.map_path, folder, "-o", tmp_path / "poses.json")
+    assert alone.code == done.code == 0
+    assert "5 frames, 2 skipped in " in done.out
+    frames = {one["name"]: one for one in json.loads((tmp_path / "poses.json").read_text())["images"]}
+    assert list(frames) == [f"{i}.png" for i in range(5)]
+    assert frames["1.png"]["reason"].startswith("not a readable image")
+    assert frames["3.png"]["reason"] == "has 320x100 pixels, the frames before 320x240"
+    poses = {name: frames[name]["cam_from_world"] for name in ("0.png", "2.png", "4.png")}
+    assert poses == poses_of(tmp_path / "good.json")
+    strict = slimsfm("track", boulder.map_path, folder, "-o", tmp_path / "strict.json", "--strict")
+    assert (strict.code, (tmp_path / "strict.json").exists()) == (2, False)
+    assert "frames/1.png: not a readable image" in strict.err
+
+
+def test_a_film_that_ends_early_is_tracked_as_far_as_it_goes(boulder, images, tmp_path):
+    film, parts = tmp_path / "film.mjpeg", (images[:3], [images[0][:100]])
+    for part in parts:
+        write_mjpeg(tmp_path / "part.mjpeg", part)
+        with film.open("ab") as file:
+            file.write((tmp_path / "part.mjpeg").read_bytes())
+    done = slimsfm("track", boulder.map_path, film, "-o", tmp_path / "poses.json")
+    assert done.code == 0
+    assert f"warning: {film}: ends before frame 3, which has 320x100 pixels" in done.out
+    assert list(poses_of(tmp_path / "poses.json")) == ["000000", "000001", "000002"]
+    strict = slimsfm("track", boulder.map_path, film, "-o", tmp_path / "strict.json", "--strict")
+    assert (strict.code, (tmp_path / "strict.json").exists()) == (2, False)
+    assert "ends before frame 3" in strict.err

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 
 from exif_photos import save_photo
 from scenes import camera, exact_map
+from slimsfm.errors import ImageError
 from slimsfm.evaluation.results import (
     PosedQuery,
     PreparedQuery,
@@ -12,6 +14,7 @@ from slimsfm.evaluation.results import (
     localize_all,
     prepare_queries,
     queries_of,
+    readable_queries,
 )
 from slimsfm.photos import Orientation
 from strategies import CLASSICAL
@@ -93,3 +96,15 @@ def test_the_frames_of_a_sequence_are_queries(boulder):
     assert [one.path for one in queries] == list(boulder.query.image_paths)
     assert [one.cam_from_world for one in queries] == list(boulder.query.cam_from_world)
     assert all(one.camera.width == 320 for one in queries)
+
+
+def test_queries_that_cannot_be_read_are_left_out_and_named(boulder, tmp_path):
+    good = queries_of(boulder.query)
+    (tmp_path / "a.png").write_bytes(good[0].path.read_bytes()[:5000])
+    broken = replace(good[1], path=tmp_path / "a.png")
+    left, skipped = readable_queries([good[0], broken, *good[1:]], boulder.query.folder)
+    assert left == good
+    assert list(skipped) == [str(tmp_path / "a.png")]
+    assert skipped[str(tmp_path / "a.png")].startswith("not a readable image")
+    with pytest.raises(ImageError, match=r"a\.png: not a readable image"):
+        readable_queries([broken], tmp_path)

@@ -188,8 +188,11 @@ def with_outcomes(result, **fields):
 
 
 def test_a_single_object_can_be_read(run, tmp_path):
-    write_json(tmp_path / "can.json", object_to_json(run.objects[0]))
-    assert digest_of([read_object_result(tmp_path / "can.json")]) == digest_of(run.objects[:1])
+    measured = replace(run.objects[0], skipped={"/a.jpg": "not a readable image"})
+    write_json(tmp_path / "can.json", object_to_json(measured))
+    found = read_object_result(tmp_path / "can.json")
+    assert digest_of([found]) == digest_of(run.objects[:1])
+    assert found.skipped == measured.skipped
 
 
 def test_infinite_numbers_are_an_error_and_the_old_file_stays(tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from outcomes import assert_same_outcomes
 from slimsfm.errors import ImageError, InputError
 from slimsfm.localization import (
     LocalizationOptions,
@@ -17,16 +18,6 @@ from slimsfm.localization.cameras import read_gravity
 from slimsfm.localization.pose_files import write_object_poses, write_poses
 from slimsfm.photos import read_image
 from slimsfm.pose.priors import Gravity
-
-
-def assert_same_outcomes(some, others):
-    assert list(some) == list(others)
-    for name, one in some.items():
-        other = others[name]
-        assert (one.pose is None) == (other.pose is None)
-        assert np.array_equal(one.points2D, other.points2D)
-        if one.pose:
-            assert np.array_equal(one.pose.cam_from_world.matrix(), other.pose.cam_from_world.matrix())
 
 
 def test_a_folder_gives_the_same_outcomes_as_its_images_one_by_one(boulder):

@@ -234,14 +234,29 @@ def test_images_that_are_missing_or_of_another_size_are_named(project, rendered,
         ImageError, match=r"frame 2\.png: 320x200 pixels, but its camera in the model has 320x240"
     ):
         import_colmap(project.model, options=ImportOptions(images=folder))
-    path.write_text("hello")
-    with pytest.raises(ImageError, match=r"frame 2\.png: not a readable image"):
-        import_colmap(project.model, options=ImportOptions(images=folder))
-    path.unlink()
-    with pytest.raises(ImageError, match=r"frame 2\.png: no such image"):
+    for name in rendered.names[1:]:
+        (folder / name).unlink()
+    with pytest.raises(ImageError, match=r"only 1 of the 8 images.*7 photos skipped: .*no such image"):
         import_colmap(project.model, options=ImportOptions(images=folder))
     with pytest.raises(InputError, match="no such folder of images"):
         import_colmap(project.model, options=ImportOptions(images=tmp_path / "missing"))
+
+
+def test_an_image_whose_photo_cannot_be_read_is_left_out(project, rendered, tmp_path):
+    folder = tmp_path / "images"
+    shutil.copytree(rendered.folder, folder)
+    cut, gone, *rest = rendered.names
+    (folder / cut).write_bytes((folder / cut).read_bytes()[:5000])
+    (folder / gone).unlink()
+    whole = import_colmap(project.model, options=ImportOptions(images=rendered.folder))
+    made = import_colmap(project.model, options=ImportOptions(images=folder))
+    assert list(made.images) == sorted(rest)
+    assert made.info.notes[1] == f"1 photo skipped: {gone} (no such image)"
+    for name in rest:
+        assert np.array_equal(made.features[name].descriptors, whole.features[name].descriptors)
+        assert made.images[name].cam_from_world() == whole.images[name].cam_from_world()
+    write_map(made, tmp_path / "map")
+    assert list(read_map(tmp_path / "map").images) == sorted(rest)
 
 
 def resized(rendered, folder, factors):

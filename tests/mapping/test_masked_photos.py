@@ -49,7 +49,7 @@ def test_masks_are_found_by_either_name(folder, named):
     found = photos(folder)
     assert all(np.array_equal(found.read(name).mask, KEPT) for name in NAMES)
     assert found.notes == ()
-    found.check()
+    found.keep(NAMES)
 
 
 def test_the_mask_of_the_whole_name_has_priority_and_others_are_named(folder):
@@ -143,13 +143,13 @@ def test_photos_that_are_masked_entirely_are_named(folder):
         found.read(name)
     empty = "2 photos without features, because a mask or transparency covers all pixels: b.jpg, d.png"
     assert empty in found.notes
-    found.check()
+    found.keep(NAMES)
     write(folder / "masks" / "a.jpg.png", 0 * KEPT)
     found = photos(folder, names)
     for name in names:
         found.read(name)
     with pytest.raises(InputError, match=r"3 photos without features.*: a\.jpg, b\.jpg, d\.png; a map needs"):
-        found.check()
+        found.keep(names)
 
 
 def test_no_observation_of_a_map_lies_on_a_transparent_pixel_and_notes_are_stored(rendered, tmp_path):

@@ -11,6 +11,7 @@ from slimsfm.cli.output import quiet
 from slimsfm.errors import InputError
 from slimsfm.geometry import reprojection_errors
 from slimsfm.mapping.pairs import exhaustive_pairs
+from slimsfm.mapping.workspace import Workspace
 from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher, in_tiles, match_without_keypoints
 from slimsfm.methods.loftr.extractor import choose_image_pairs, neighboring_pairs
 from slimsfm.methods.loftr.mapping import KeypointFreeModel, build_without_keypoints
@@ -41,7 +42,7 @@ class Sphere:
                 exhaustive_pairs(self.photos),
                 self.matcher,
                 cameras,
-                workspace,
+                Workspace(workspace, {}),
                 cam_from_world=poses,
                 **options,
             )
@@ -80,9 +81,9 @@ def test_the_matcher_of_the_tests_is_one(scene):
     assert isinstance(scene.matcher.encode(scene.photos[NAMES[0]]), EncodedImage)
 
 
-def test_keypoints_are_the_matched_cells_each_once_the_surest_first(scene):
+def test_keypoints_are_the_matched_cells_each_once_the_surest_first(scene, tmp_path):
     pairs = exhaustive_pairs(NAMES)
-    cells = match_without_keypoints(scene.photos, pairs, scene.matcher)
+    cells = match_without_keypoints(scene.photos, pairs, scene.matcher, Workspace(tmp_path, {}))
     encoded = {name: scene.matcher.encode(scene.photos[name]) for name in NAMES}
     for name, features in cells.features.items():
         assert len(np.unique(features.keypoints, axis=0)) == len(features) > 50
@@ -97,10 +98,11 @@ def test_keypoints_are_the_matched_cells_each_once_the_surest_first(scene):
         assert np.array_equal(np.unique(found, axis=0), np.unique(given, axis=0))
 
 
-def test_masked_cells_do_not_match(scene):
+def test_masked_cells_do_not_match(scene, tmp_path):
     mask = np.zeros((480, 640), np.uint8)
     mask[:, 320:] = 255
-    cells = match_without_keypoints(scene.photos, exhaustive_pairs(NAMES), scene.matcher, {NAMES[2]: mask})
+    pairs, masks = exhaustive_pairs(NAMES), {NAMES[2]: mask}
+    cells = match_without_keypoints(scene.photos, pairs, scene.matcher, Workspace(tmp_path, {}), masks)
     assert cells.features[NAMES[2]].keypoints[:, 0].min() > 320
     assert cells.features[NAMES[1]].keypoints[:, 0].min() < 320
 
@@ -252,7 +254,7 @@ def test_it_runs_with_a_network(tmp_path):
     cameras = dict.fromkeys(photos, made)
     with quiet():
         found = build_without_keypoints(
-            photos, exhaustive_pairs(photos), matcher, cameras, tmp_path, cam_from_world=poses
+            photos, exhaustive_pairs(photos), matcher, cameras, Workspace(tmp_path, {}), cam_from_world=poses
         )
     assert len(found.model.points3D) > 10
     for name, features in found.features.items():

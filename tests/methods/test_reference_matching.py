@@ -19,6 +19,7 @@ from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import exhaustive_pairs
 from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.workspace import Workspace
 from slimsfm.methods.loftr.extractor import DetectorFree, DetectorFreeMatching
 from slimsfm.methods.loftr.mapping import build_without_keypoints
 from slimsfm.pose import estimate_pose
@@ -46,7 +47,7 @@ def sphere(tmp_path_factory) -> Map:
             exhaustive_pairs(NAMES),
             matcher(),
             dict.fromkeys(NAMES, made),
-            tmp_path_factory.mktemp("sphere"),
+            Workspace(tmp_path_factory.mktemp("sphere"), {}),
             cam_from_world=dict(zip(NAMES, POSES, strict=False)),
         )
     info = MapInfo(extractor="loftr", box=BOX, box_source="given", origin="made by the tests")

@@ -14,6 +14,7 @@ from slimsfm.evaluation.benchmark import BenchmarkOptions, BenchmarkSetup
 from slimsfm.evaluation.comparison import compare_runs
 from slimsfm.evaluation.result_files import digest_of, read_run, write_results
 from slimsfm.evaluation.run import run_benchmark
+from slimsfm.files.space import check_place
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.progress import shown
 
@@ -47,6 +48,7 @@ def benchmark(
     networks.apply()
     if (build.extractor, build.matcher) != (BuildOptions().extractor, BuildOptions().matcher):
         raise InputError("build.extractor and build.matcher are ignored; use `methods=EXTRACTOR+MATCHER`")
+    check_place(output)
     setup = BenchmarkSetup(folder=output, options=comparison, build=build, progress=shown)
     with resumable():
         run = run_benchmark(dataset, setup, execution.open_executor(), shown, overwrite=overwrite)
@@ -62,7 +64,9 @@ def benchmark(
         raise InputError(f"{name}: {why} ({count} could not be measured; fix this and run the command again)")
     objects = plural(len(run.objects), "object")
     queries = plural(sum(len(one.queries) for one in run.objects), "query", "queries")
-    what = f"{output}: {objects}, {queries}, digest {digest_of(run.objects)}"
+    skipped = sum(len(one.skipped) for one in run.objects)
+    left_out = f" ({skipped} skipped)" if skipped else ""
+    what = f"{output}: {objects}, {queries}{left_out}, digest {digest_of(run.objects)}"
     finish(what, watch, "report", output, "-o", "report.html")
 
 

@@ -5,8 +5,10 @@ from typing import Annotated
 from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map, plural
+from slimsfm.files.work_folder import work_folder
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
+from slimsfm.mapping.space import bytes_to_build
 from slimsfm.progress import shown
 
 
@@ -31,9 +33,11 @@ def build_photos(
     """
     watch = Stopwatch()
     networks.apply()
-    check_output(output, images, build.masks, build.box, overwrite=overwrite)
-    made = build_map(images, build, progress=shown)
-    write_map(made, output, overwrite=overwrite)
+    needed = bytes_to_build(images, build)
+    check_output(output, images, build.masks, build.box, overwrite=overwrite, least_bytes=needed)
+    with work_folder(output) as workspace:
+        made = build_map(images, build, workspace=workspace, progress=shown)
+        write_map(made, output, overwrite=overwrite)
     if made.unregistered:
         names = ", ".join(made.unregistered)
         console.print(f"{len(made.unregistered)} photos could not be registered: {names}", style="yellow")

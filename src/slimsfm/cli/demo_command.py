@@ -12,6 +12,7 @@ from slimsfm.evaluation.benchmark import BenchmarkSetup
 from slimsfm.evaluation.result_files import write_results
 from slimsfm.evaluation.run import run_benchmark
 from slimsfm.execution import num_cores, processes
+from slimsfm.files.space import check_place
 from slimsfm.progress import shown
 
 _OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=32, query_frames=16)
@@ -31,6 +32,7 @@ def demo(
     watch = Stopwatch()
     if output.exists() and any(output.iterdir() if output.is_dir() else [output]) and not overwrite:
         raise OutputError(f"{output}: exists already; choose another output or pass `overwrite=True`")
+    check_place(output)
     folder, report = output / "objects", output / "report.html"
     with processes(num_cores()) as executor:
         synthesize(folder, _OBJECTS, overwrite=overwrite, progress=shown, executor=executor)

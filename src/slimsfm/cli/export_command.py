@@ -8,7 +8,7 @@ from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural, size
 from slimsfm.errors import OutputError
 from slimsfm.features.registry import export_method
-from slimsfm.files import check_writable, replacing
+from slimsfm.files import replacing
 from slimsfm.image_files import named
 from slimsfm.mapping.hloc import read_query_names, write_hloc
 from slimsfm.mapping.io import read_map
@@ -37,7 +37,7 @@ def export_onnx(
     networks.apply()
     if output.is_dir():
         raise OutputError(f"{output}: is a folder; name a file, such as {output / method}.onnx")
-    check_writable(output, overwrite=overwrite)
+    check_output(output, overwrite=overwrite)
     export_method(method, output, overwrite=overwrite)
     finish(f"{output}: {method}, {size(output.stat().st_size)}", watch)
     console.print(

@@ -8,8 +8,8 @@ import numpy as np
 
 from slimsfm.cli.arguments import Execution, Networks, resumable
 from slimsfm.cli.options import Advanced, Flags, MapPath
-from slimsfm.cli.output import Stopwatch, console, finish
-from slimsfm.files import check_writable, replacing
+from slimsfm.cli.output import Stopwatch, check_output, console, finish
+from slimsfm.files import replacing
 from slimsfm.graph import GraphOptions, GraphRun
 from slimsfm.graph.compute import estimate_recall, load_or_compute_graph
 from slimsfm.graph.edge_sources import resolve_edges
@@ -46,7 +46,7 @@ def graph(
     networks.apply()
     for path in (output, json):
         if path:
-            check_writable(path, overwrite=overwrite)
+            check_output(path, overwrite=overwrite)
     map_ = read_map(map)
     with resumable():
         run = load_or_compute_graph(map_, map, edges, execution.open_executor(), shown)

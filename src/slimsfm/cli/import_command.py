@@ -4,6 +4,7 @@ from slimsfm.cli.options import ModelPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import write_map
+from slimsfm.mapping.space import bytes_to_import
 from slimsfm.progress import shown
 
 
@@ -23,7 +24,8 @@ def import_(
         overwrite: Replace an existing map.
     """
     watch = Stopwatch()
-    check_output(output, model, *source.paths(model), overwrite=overwrite)
+    needed = bytes_to_import(model)
+    check_output(output, model, *source.paths(model), overwrite=overwrite, least_bytes=needed)
     made = import_colmap(model, options=source, progress=shown)
     write_map(made, output, overwrite=overwrite)
     console.print(f"box {made.info.box_source}, diagonal {made.box.diagonal:.3g} map units")

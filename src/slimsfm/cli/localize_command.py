@@ -37,6 +37,7 @@ def localize(
     camera: Path | None = None,
     gravity: Path | None = None,
     workers: int | None = None,
+    strict: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Estimate the camera poses of images.
@@ -54,6 +55,7 @@ def localize(
         gravity: Direction of gravity as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame
             of the map and in the camera frames of the images.
         workers: Number of images to localize at a time, by default the number of cores.
+        strict: Stop at the first image that cannot be used, instead of skipping it.
         overwrite: Replace an existing output.
     """
     watch = Stopwatch()
@@ -67,13 +69,13 @@ def localize(
     shared = {"camera": camera_of_all, "workers": workers, "progress": shown}
     again: dict[str, Localization] = {}
     if also:
-        by_object = localize_objects(MultiLocalizer(localizers), images, **shared)
+        by_object = localize_objects(MultiLocalizer(localizers), images, strict=strict, **shared)
         write_object_poses(output, by_object, overwrite=overwrite)
     else:
         ((name, only),) = localizers.items()
         shared["gravity"] = read_gravity(gravity) if gravity else None
         fallback = _full_map(full, only) if full else None
-        results = localize_images(only, images, **shared)
+        results = localize_images(only, images, strict=strict, **shared)
         again = localize_failed(fallback, results, images, **shared) if fallback else {}
         by_object = {name: {**results, **again}}
         write_poses(output, by_object[name], overwrite=overwrite)
@@ -81,7 +83,10 @@ def localize(
     if again:
         saved = sum(one.pose is not None for one in again.values())
         console.print(f"{full}: gave {saved} of the {plural(len(again), 'pose')} that {map} did not")
-    finish(f"{output}: {found} of {plural(len(next(iter(by_object.values()))), 'image')} localized", watch)
+    first = next(iter(by_object.values()))
+    skipped = sum(one.is_skipped for one in first.values())
+    left_out = f", {skipped} skipped" if skipped else ""
+    finish(f"{output}: {found} of {plural(len(first), 'image')} localized{left_out}", watch)
 
 
 def _check_options(workers: int | None, also: Collection[Path], **of_one_map: Path | None) -> None:
@@ -121,9 +126,10 @@ def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collectio
                 f"{name}: {_outcome(results[image])}{', full map' * (image in again)}",
                 style=None if results[image].pose else "yellow",
             )
-    seconds = [one.seconds for results in by_object.values() for one in results.values()]
+    searched = [one for results in by_object.values() for one in results.values() if not one.is_skipped]
+    queries = len(searched) / len(by_object)
     times = {
-        stage: 1e3 * sum(getattr(one, stage) for one in seconds) / len(images)
+        stage: 1e3 * sum(getattr(one.seconds, stage) for one in searched) / queries
         for stage in ("extract", "match", "pose")
     }
     console.print("per query: " + ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in times.items()))
@@ -132,7 +138,7 @@ def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collectio
 
 def _outcome(one: Localization) -> str:
     if one.pose is None:
-        return "not localized"
+        return f"{'skipped' if one.is_skipped else 'not localized'}: {one.reason}"
     inliers = f"{one.pose.num_inliers} inliers of {one.num_matches} matches"
     return f"{inliers}, confidence {one.pose.confidence:.2f}{_estimated(one)}"
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from slimsfm.cli.parsing import with_flags
 from slimsfm.errors import OutputError
 from slimsfm.files import check_writable
+from slimsfm.files.space import check_place
 from slimsfm.mapping.map import Map
 
 _WIDTH = 170  # of the widest table; a narrower terminal wraps lines, but no number is cut off
@@ -26,17 +27,18 @@ class _Console(Console):
 console = _Console(highlight=False, markup=False, soft_wrap=True, width=_WIDTH)
 
 
-def check_output(output: Path, *sources: Path | None, overwrite: bool) -> None:
+def check_output(output: Path, *sources: Path | None, overwrite: bool, least_bytes: int = 0) -> None:
     """Check, before any work is done, that an output can be written and does not replace its sources.
 
     Raises:
-        OutputError: The output exists and `overwrite` is off, its folder cannot be created, or it is or
-            contains a source.
+        OutputError: The output exists and `overwrite` is off, it cannot be created, there is no room for
+            `least_bytes`, or it is or contains a source.
     """
     for source in sources:
         if source is not None and source.resolve().is_relative_to(output.resolve()):
             raise OutputError(f"{output}: is or contains the input {source}; choose another output")
     check_writable(output, overwrite=overwrite)
+    check_place(output, least_bytes=least_bytes)
 
 
 @contextmanager

@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 from slimsfm.cli.options import Argument, OutputPath
-from slimsfm.cli.output import Stopwatch, finish
+from slimsfm.cli.output import Stopwatch, check_output, finish
 from slimsfm.cli.tables import print_map_warnings
 from slimsfm.errors import InputError
 from slimsfm.evaluation.result_files import read_run
-from slimsfm.files import check_writable
 
 
 def report(
@@ -29,7 +28,7 @@ def report(
     from slimsfm.report import write_report  # imports matplotlib
 
     watch = Stopwatch()
-    check_writable(output, overwrite=overwrite)
+    check_output(output, overwrite=overwrite)
     measured = read_run(run)
     if not measured.objects:
         raise InputError(f"{run}: no object could be measured; run slimsfm benchmark again")

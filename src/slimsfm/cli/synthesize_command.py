@@ -4,6 +4,7 @@ from slimsfm.cli.options import OutputPath
 from slimsfm.cli.output import Stopwatch, finish, plural
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.execution import num_cores, processes
+from slimsfm.files.space import check_place
 from slimsfm.progress import shown
 
 
@@ -20,6 +21,7 @@ def synthesize_objects(
         overwrite: Replace existing objects.
     """
     watch = Stopwatch()
+    check_place(output)
     with processes(num_cores()) as executor:
         made = synthesize(output, synthesis, overwrite=overwrite, progress=shown, executor=executor)
     frames = sum(len(one.mapping.image_paths) + len(one.query.image_paths) for one in made)

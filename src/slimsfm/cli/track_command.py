@@ -7,7 +7,7 @@ from typing import Annotated
 from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
-from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
 from slimsfm.mapping.io import read_map
@@ -29,6 +29,7 @@ def track(
     tracker: Annotated[TrackerOptions, Advanced()] = TrackerOptions(),
     localization: Annotated[LocalizationOptions, Advanced()] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
+    strict: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Track an object through a video and write the camera pose of every frame.
@@ -43,6 +44,7 @@ def track(
         tracker: How to track.
         localization: How to localize.
         networks: Where learned methods run.
+        strict: Stop at the first frame that cannot be used, and write nothing.
         overwrite: Replace existing outputs.
     """
     watch = Stopwatch()
@@ -55,16 +57,27 @@ def track(
     given = read_camera(camera) if camera else None
     localizer = Localizer(read_map(map), localization)
     tracked = track_video(
-        localizer, source, tracker, camera=given, video=video, overwrite=overwrite, progress=_shown
+        localizer,
+        source,
+        tracker,
+        camera=given,
+        video=video,
+        overwrite=overwrite,
+        strict=strict,
+        progress=_shown,
     )
-    frames = tracked.frames
+    frames, orientation = tracked.frames, localizer.map.info.orientation
     poses = {name: one.localization for name, one in frames.items()}
-    seconds = {name: one.frame_seconds for name, one in frames.items()}
+    poses |= {name: Localization.skipped(why, orientation) for name, why in tracked.skipped.items()}
+    if tracked.skipped:
+        poses = dict(sorted(poses.items()))  # images of a folder are read in this order
+    seconds = {name: frames[name].frame_seconds if name in frames else None for name in poses}
     write_poses(output, poses, seconds=seconds, overwrite=overwrite)
     _sum_up(output, list(frames.values()))
     if tracked.ended_early:
         console.print(f"warning: {tracked.ended_early}", style="bold red", markup=False)
-    finish(f"{video or output}: {plural(len(frames), 'frame')}", watch)
+    left_out = f", {len(tracked.skipped)} skipped" if tracked.skipped else ""
+    finish(f"{video or output}: {plural(len(poses), 'frame')}{left_out}", watch)
 
 
 def _shown(frames: FrameSource) -> Iterator[VideoFrame]:

@@ -15,6 +15,7 @@ from slimsfm.evaluation.results import (
     map_path,
     prepare_queries,
     queries_of,
+    readable_queries,
 )
 from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
 from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
@@ -136,9 +137,14 @@ def benchmark_object(sequences: ObjectSequences, setup: BenchmarkSetup) -> Objec
     """Map an object and localize its queries with every method and strategy against every variant.
 
     Impossible combinations are left out: a map that supports only direct matching has no measurement for
-    other strategies, and a map without keypoints has none for direct matching.
+    other strategies, and a map without keypoints has none for direct matching. Queries that cannot be read
+    are skipped with a warning.
+
+    Raises:
+        ImageError: No query can be read.
     """
     queries = [replace(query, path=query.path.resolve()) for query in queries_of(sequences.query)]
+    queries, skipped = readable_queries(queries, sequences.query.folder)
     maps, measurements = [], []
     for method in setup.options.parsed_methods:
         task = _MethodTask(sequences, method, setup)
@@ -155,6 +161,7 @@ def benchmark_object(sequences: ObjectSequences, setup: BenchmarkSetup) -> Objec
         queries=tuple(queries),
         maps=tuple(maps),
         measurements=tuple(measurements),
+        skipped=skipped,
     )
 
 

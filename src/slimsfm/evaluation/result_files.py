@@ -65,6 +65,7 @@ def object_to_json(result: ObjectResult) -> dict:
             }
             for one in result.measurements
         ],
+        **({"skipped_queries": dict(result.skipped)} if result.skipped else {}),
     }
 
 
@@ -90,6 +91,7 @@ def object_from_json(data: dict) -> ObjectResult:
             )
             for one in data["cells"]
         ),
+        skipped=dict(data.get("skipped_queries", {})),
     )
     counts = {len(run.outcomes) for one in found.measurements for run in one.map_runs}
     if counts - {len(found.queries)}:

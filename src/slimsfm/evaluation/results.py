@@ -1,7 +1,7 @@
 """Outcomes of queries, how queries are localized and judged, and measurements per table row."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
@@ -21,6 +21,7 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation, read_image, read_photo
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.skipping import SkippedPhotos
 
 STAGES = ("extract", "match", "pose")
 """Stages of localizing a query, in this order."""
@@ -190,6 +191,9 @@ class ObjectResult:
 
     measurements: tuple[Measurement, ...]
     """Sorted by method, then by strategy, in the order of the options."""
+
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    """Why queries were not measured, by path: they cannot be read."""
 
     def measurement(self, method: str, strategy: str, variant: str) -> Measurement | None:
         """The measurement with this key, or None if it does not exist."""
@@ -363,6 +367,22 @@ def queries_of(sequence: PosedSequence) -> list[PosedQuery]:
             sequence.image_paths, sequence.cameras, sequence.cam_from_world, strict=True
         )
     ]
+
+
+def readable_queries(
+    queries: Sequence[PosedQuery], folder: Path
+) -> tuple[list[PosedQuery], Mapping[str, str]]:
+    """The queries that can be read, and why others cannot, by path.
+
+    Raises:
+        ImageError: No query can be read.
+    """
+    skipped = SkippedPhotos(folder)
+    for query in queries:
+        with skipped.skipping(str(query.path)):
+            read_photo(query.path, query.orientation, warn=False)
+    left = set(skipped.left(str(query.path) for query in queries))
+    return [query for query in queries if str(query.path) in left], skipped.reasons
 
 
 def prepare_queries(

@@ -1,8 +1,7 @@
 """Localize images against several maps, and all images of a folder on several threads."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple, get_args
@@ -20,6 +19,7 @@ from slimsfm.localization.shared_cameras import corrected_cameras, share_cameras
 from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.skipping import SkippedPhotos
 
 
 class MultiLocalizer:
@@ -86,12 +86,14 @@ def localize_images(
     camera: pycolmap.Camera | None = None,
     gravity: Mapping[str, Gravity] | None = None,
     workers: int | None = None,
+    strict: bool = False,
     progress: ProgressBar = silent,
 ) -> dict[str, Localization]:
     """Localize the images of a folder.
 
-    Results do not depend on the number of workers. Transparent pixels of an image hold no features,
-    unless all are.
+    Results do not depend on the number of workers. Images that cannot be read, or whose intrinsics are not
+    known well enough, are skipped with a warning; the others get the same poses as without them. Transparent
+    pixels of an image hold no features, unless all are.
 
     Args:
         localizer: Localizer of the map.
@@ -100,18 +102,21 @@ def localize_images(
             not given.
         gravity: Direction of gravity by image name; images may be missing.
         workers: Images to localize at a time; the number of cores if not given.
+        strict: Whether to raise the error of the first image that cannot be used, instead of skipping it.
         progress: Progress bar, one step per image.
 
     Returns:
-        The outcome of each image, localized or not, by its name relative to the folder, in sorted order.
+        The outcome of each image, localized or not or skipped, by its name relative to the folder, in sorted
+        order.
 
     Raises:
         InputError: There is no image.
-        ImageError: An image cannot be read, or its intrinsics are not known well enough.
+        ImageError: No image can be used or, if `strict`, one cannot.
         ValueError: `workers` is below 1.
     """
     multi = MultiLocalizer({_ONLY: localizer})
-    return _localize(multi, Path(images), camera, gravity or {}, workers, progress)[_ONLY]
+    batch = _Batch(multi, Path(images), gravity or {}, workers, strict=strict)
+    return batch.localize(camera, progress)[_ONLY]
 
 
 def localize_objects(
@@ -120,6 +125,7 @@ def localize_objects(
     *,
     camera: pycolmap.Camera | None = None,
     workers: int | None = None,
+    strict: bool = False,
     progress: ProgressBar = silent,
 ) -> dict[str, dict[str, Localization]]:
     """Search the images of a folder for several objects.
@@ -130,104 +136,138 @@ def localize_objects(
     Returns:
         For each object, in the order of the localizers, the outcome of each image by its name.
     """
-    return _localize(localizer, Path(images), camera, {}, workers, progress)
+    return _Batch(localizer, Path(images), {}, workers, strict=strict).localize(camera, progress)
 
 
 class _Task(NamedTuple):
     name: str
     path: Path
-    cameras: Mapping[str, QueryCamera]
+    cameras: Mapping[str, QueryCamera]  # by name of the object
 
 
-def _localize(
-    localizer: MultiLocalizer,
-    images: Path,
-    camera: pycolmap.Camera | None,
-    gravity: Mapping[str, Gravity],
-    workers: int | None,
-    progress: ProgressBar,
-) -> dict[str, dict[str, Localization]]:
-    if workers is not None and workers < 1:
-        raise ValueError(f"workers must be at least 1, got {workers}")
-    run = partial(_localize_all, localizer, gravity, workers or num_cores())
-    tasks = _with_shared_cameras(_tasks(localizer, images, camera), localizer, run)
-    strategies = {one.options.strategy_for(one.map) for one in localizer.localizers.values()}
-    label = f"localize ({', '.join(sorted(strategies))})"
-    outcomes = run(tasks)
-    by_image = {task.name: next(outcomes) for task in progress(tasks, label)}
-    again = list(_with_corrected_cameras(tasks, localizer, by_image))
-    for task, found in zip(again, run(again), strict=True):
-        by_image[task.name] = {**by_image[task.name], **found}
-    return {key: {name: outcomes[key] for name, outcomes in by_image.items()} for key in localizer.localizers}
+_ByImage = dict[str, dict[str, Localization]]  # by name of the image, by name of the object
 
 
-def _tasks(localizer: MultiLocalizer, images: Path, camera: pycolmap.Camera | None) -> list[_Task]:
-    """All images with their intrinsics, so that an image without intrinsics fails before the work begins."""
-    folder, names = (images.parent, [images.name]) if images.is_file() else (images, list_images(images))
-    check_names(folder, names)
-    return [
-        _Task(
-            name=name,
-            path=folder / name,
-            cameras={
-                key: query_camera(one.map, folder / name, camera, one.options.focal)
-                for key, one in localizer.localizers.items()
-            },
+class _Batch:
+    """Localizes the images of a folder; remembers those that cannot be used."""
+
+    def __init__(
+        self,
+        localizer: MultiLocalizer,
+        images: Path,
+        gravity: Mapping[str, Gravity],
+        workers: int | None,
+        *,
+        strict: bool,
+    ) -> None:
+        if workers is not None and workers < 1:
+            raise ValueError(f"workers must be at least 1, got {workers}")
+        is_one = images.is_file()
+        self._folder, self._names = (
+            (images.parent, [images.name]) if is_one else (images, list_images(images))
         )
-        for name in names
-    ]
+        check_names(self._folder, self._names)
+        self._maps, self._gravity = localizer.localizers, gravity
+        self._workers, self._strict = workers or num_cores(), strict
+        self._skipped = SkippedPhotos(self._folder, strict=strict)
+
+    def localize(
+        self, camera: pycolmap.Camera | None, progress: ProgressBar
+    ) -> dict[str, dict[str, Localization]]:
+        """The outcome of each image by name, by name of the object."""
+        given = self._tasks(camera)
+        tasks = self._with_shared_cameras(given)
+        strategies = {one.options.strategy_for(one.map) for one in self._maps.values()}
+        outcomes = self._run(tasks)
+        by_image: _ByImage = {
+            task.name: next(outcomes)
+            for task in progress(tasks, f"localize ({', '.join(sorted(strategies))})")
+        }
+        left = set(self._skipped.left(self._names))
+        if len(left) < len(tasks):  # cameras must not depend on images that turned out to be broken
+            before = {task.name: task for task in tasks}
+            tasks = self._with_shared_cameras([task for task in given if task.name in left])
+            self._update(by_image, [one for one in tasks if _differ(one, before[one.name])])
+        self._update(by_image, list(_with_corrected_cameras(tasks, self._maps, by_image)))
+        return {key: {name: self._outcome(by_image, name, key) for name in self._names} for key in self._maps}
+
+    def _tasks(self, camera: pycolmap.Camera | None) -> list[_Task]:
+        """The images with their intrinsics; fails before the work begins if no image has any."""
+        tasks = []
+        for name in self._names:
+            path = self._folder / name
+            with self._skipped.skipping(name):
+                cameras = {
+                    key: query_camera(one.map, path, camera, one.options.focal)
+                    for key, one in self._maps.items()
+                }
+                tasks.append(_Task(name=name, path=path, cameras=cameras))
+        self._skipped.left(self._names)
+        return tasks
+
+    def _with_shared_cameras(self, tasks: list[_Task]) -> list[_Task]:
+        """The images, with focal lengths that those of one camera agree on where the user leaves it open."""
+        by_name = {task.name: task for task in tasks}
+        for key, one in self._maps.items():
+            if one.options.focal == "auto":
+                cameras = {task.name: task.cameras[key] for task in tasks}
+                shared = share_cameras(cameras, lambda some, key=key: self._outcomes(by_name, some, key))
+                for name, camera in shared.items():
+                    by_name[name] = by_name[name]._replace(cameras={**by_name[name].cameras, key: camera})
+        return list(by_name.values())
+
+    def _outcomes(self, tasks: Mapping[str, _Task], names: Sequence[str], key: str) -> list[Localization]:
+        some = [tasks[name]._replace(cameras={key: tasks[name].cameras[key]}) for name in names]
+        return [found[key] for found in self._run(some) if found]
+
+    def _run(self, tasks: Sequence[_Task]) -> Iterator[dict[str, Localization]]:
+        return map_on_threads(self._localize_one, tasks, self._workers)
+
+    def _localize_one(self, task: _Task) -> dict[str, Localization]:
+        """Localize an image against the maps that its task has cameras for, read as each of them says.
+
+        Returns nothing if the image cannot be read.
+        """
+        found: dict[str, Localization] = {}
+        wanted = {key: one for key, one in self._maps.items() if key in task.cameras}
+        if task.name in self._skipped.reasons:
+            return {}
+        with self._skipped.skipping(task.name):
+            for orientation in get_args(Orientation):
+                alike = {k: one for k, one in wanted.items() if one.map.info.orientation == orientation}
+                if alike:
+                    photo = read_photo(task.path, orientation)
+                    multi, down = MultiLocalizer(alike), self._gravity.get(task.name)
+                    found |= multi.localize(photo.image, task.cameras, down, photo.visible)
+            return {key: found[key] for key in wanted}
+        return {}
+
+    def _outcome(self, by_image: _ByImage, name: str, key: str) -> Localization:
+        if reason := self._skipped.reasons.get(name):
+            return Localization.skipped(reason, self._maps[key].map.info.orientation)
+        return by_image[name][key]
+
+    def _update(self, by_image: _ByImage, again: Sequence[_Task]) -> None:
+        """Localize images again, with other cameras."""
+        for task, found in zip(again, self._run(again), strict=True):
+            by_image[task.name] = {**by_image[task.name], **found}
 
 
-def _with_shared_cameras(tasks: list[_Task], localizer: MultiLocalizer, run: "_Run") -> list[_Task]:
-    """The images, with focal lengths that those of one camera agree on where the user leaves it open."""
-    by_name = {task.name: task for task in tasks}
-    for key, one in localizer.localizers.items():
-        if one.options.focal == "auto":
-            cameras = {task.name: task.cameras[key] for task in tasks}
-            shared = share_cameras(cameras, lambda some, key=key: _outcomes(run, by_name, some, key))
-            for name, camera in shared.items():
-                by_name[name] = by_name[name]._replace(cameras={**by_name[name].cameras, key: camera})
-    return list(by_name.values())
-
-
-def _outcomes(run: "_Run", tasks: Mapping[str, _Task], names: Sequence[str], key: str) -> list[Localization]:
-    some = [tasks[name]._replace(cameras={key: tasks[name].cameras[key]}) for name in names]
-    return [found[key] for found in run(some)]
+def _differ(one: _Task, other: _Task) -> bool:
+    """Whether an image has got another camera."""
+    pairs = [(one.cameras[key], other.cameras[key]) for key in one.cameras]
+    return any(a.source != b.source or a.camera.todict() != b.camera.todict() for a, b in pairs)
 
 
 def _with_corrected_cameras(
-    tasks: list[_Task], localizer: MultiLocalizer, by_image: Mapping[str, Mapping[str, Localization]]
+    tasks: list[_Task], maps: Mapping[str, Localizer], by_image: _ByImage
 ) -> Iterator[_Task]:
     """The images to localize again, because most others of their camera contradicted it."""
-    for key, one in localizer.localizers.items():
+    for key, one in maps.items():
         if one.options.focal == "auto":
             cameras = {task.name: task.cameras[key] for task in tasks}
-            found = {name: outcomes[key] for name, outcomes in by_image.items()}
+            found = {name: by_image[name][key] for name in cameras}
             corrected = corrected_cameras(cameras, found)
             yield from (
                 task._replace(cameras={key: corrected[task.name]}) for task in tasks if task.name in corrected
             )
-
-
-_Run = Callable[[Sequence[_Task]], Iterator[dict[str, Localization]]]
-
-
-def _localize_all(
-    localizer: MultiLocalizer, gravity: Mapping[str, Gravity], workers: int, tasks: Sequence[_Task]
-) -> Iterator[dict[str, Localization]]:
-    return map_on_threads(partial(_localize_one, localizer, gravity), tasks, workers)
-
-
-def _localize_one(
-    localizer: MultiLocalizer, gravity: Mapping[str, Gravity], task: _Task
-) -> dict[str, Localization]:
-    """Localize an image against the maps that its task has cameras for; it is read as each of them says."""
-    found: dict[str, Localization] = {}
-    wanted = {key: one for key, one in localizer.localizers.items() if key in task.cameras}
-    for orientation in get_args(Orientation):
-        alike = {k: one for k, one in wanted.items() if one.map.info.orientation == orientation}
-        if alike:
-            photo = read_photo(task.path, orientation)
-            multi, down = MultiLocalizer(alike), gravity.get(task.name)
-            found |= multi.localize(photo.image, task.cameras, down, photo.visible)
-    return {key: found[key] for key in wanted}

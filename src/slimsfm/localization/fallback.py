@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from slimsfm.errors import InputError
+from slimsfm.errors import ImageError, InputError
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.localization.batch import localize_images
 from slimsfm.localization.localizer import Localizer
@@ -53,19 +53,22 @@ def localize_failed(
 
     Returns:
         By name, the outcomes of the images without a pose, in order. Their times include those of the reduced
-        map. `{**found, **localize_failed(...)}` are the outcomes of all images.
+        map. `{**found, **localize_failed(...)}` are the outcomes of all images. Images that were skipped stay
+        so, and the outcome of the reduced map stays where the full one does not know the intrinsics.
 
     Raises:
         InputError: As in `localize_images`.
-        ImageError: As in `localize_images`.
     """
     folder = Path(images).parent if Path(images).is_file() else Path(images)
-    failed = [name for name, one in found.items() if one.pose is None]
+    failed = [name for name, one in found.items() if one.pose is None and not one.is_skipped]
 
     def localize_again(name: str) -> Localization:
         path, down = folder / name, (gravity or {}).get(name)
         given = {} if down is None else {path.name: down}
-        (one,) = localize_images(full, path, camera=camera, gravity=given, workers=1).values()
+        try:
+            (one,) = localize_images(full, path, camera=camera, gravity=given, workers=1).values()
+        except ImageError:
+            return found[name]
         return replace(one, seconds=_sum(found[name].seconds, one.seconds))
 
     run = map_on_threads(localize_again, failed, workers or num_cores())

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import pycolmap
 
 from slimsfm.arrays import Points2D, Points3D
@@ -36,8 +37,14 @@ class Localization:
     pose: PoseEstimate | None
     """Pose of the camera; None if the query could not be localized."""
 
+    reason: str | None = None
+    """Why there is no pose; None if there is one."""
+
+    is_skipped: bool = False
+    """Whether the query was not searched, because it cannot be read or its intrinsics are not known."""
+
     camera: pycolmap.Camera
-    """The intrinsics, with those that were estimated."""
+    """The intrinsics, with those that were estimated; an empty camera, of no model, if it was skipped."""
 
     camera_source: CameraSource = "given"
     """Where the intrinsics come from, apart from those that were estimated."""
@@ -62,6 +69,22 @@ class Localization:
 
     orientation: Orientation = "upright"
     """Which pixels of the image the pose is of: as in the map."""
+
+    @classmethod
+    def skipped(cls, reason: str, orientation: Orientation = "upright") -> "Localization":
+        """The outcome of a query that was not searched."""
+        return cls(
+            pose=None,
+            reason=reason,
+            is_skipped=True,
+            camera=pycolmap.Camera(),
+            camera_source="unknown",
+            points2D=np.zeros((0, 2)),
+            points3D_in_world=np.zeros((0, 3)),
+            references=0,
+            seconds=Seconds(extract=0.0, match=0.0, pose=0.0),
+            orientation=orientation,
+        )
 
     @property
     def camera_estimated(self) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ def write_poses(
 ) -> None:
     """Write poses in the format that the name of the file asks for.
 
-    - `.json` and `.csv` hold every query, localized or not, and how long it took.
+    - `.json` and `.csv` hold every query, localized or not, why not, and how long it took.
     - `images.txt` holds the localized queries in COLMAP's format, which has no names with spaces.
     - Any other `.txt`, and `.tum`, holds the localized queries as a TUM trajectory: one line
       `index tx ty tz qx qy qz qw` per pose of a camera in the world; the index counts all queries. Where all
@@ -119,12 +119,13 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
         {
             **label,
             "localized": one.pose is not None,
+            "reason": one.reason,
             "cam_from_world": one.pose and _pose_to_json(one.pose.cam_from_world),
             "confidence": one.pose and one.pose.confidence,
             "predicted_corner_error": one.predicted_corner_error,
             "covariance": one.pose and _covariance_to_json(one.pose),
             "orientation": one.orientation,
-            "focal_length_px": one.camera.mean_focal_length(),
+            "focal_length_px": None if one.is_skipped else one.camera.mean_focal_length(),
             "camera_source": one.camera_source,
             "camera_estimated": list(one.camera_estimated),
             "position_bound_95": one.pose and one.pose.position_bound,
@@ -138,6 +139,7 @@ def _write_json(file: TextIO, rows: list[_Row]) -> None:
     ]
     convention = (
         "cam_from_world: x_in_cam = R @ x_in_world + t; quaternions are x, y, z, w; "
+        "reason: why an image is not localized; "
         "confidence: probability of a corner error below a tenth of the box's diagonal; "
         "predicted_corner_error: over the diagonal; "
         "position_bound_95 (map units), rotation_bound_95_deg: hold with 95 % probability; "
@@ -174,12 +176,12 @@ def _write_csv(file: TextIO, rows: list[_Row]) -> None:
     times = ["ms_extract", "ms_match", "ms_pose", "ms_total"]
     pose = ["qw", "qx", "qy", "qz", "tx", "ty", "tz", "confidence", "inliers", "matches"]
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([*(rows[0][0] if rows else ["name"]), *pose, *times, "orientation"])
+    writer.writerow([*(rows[0][0] if rows else ["name"]), *pose, *times, "orientation", "reason"])
     for label, one in rows:
         values = [*_colmap_values(one.pose.cam_from_world), one.pose.confidence] if one.pose else [""] * 8
         inliers = one.pose.num_inliers if one.pose else 0
         counts, times_ms = (inliers, one.num_matches), _milliseconds(one).values()
-        writer.writerow([*label.values(), *values, *counts, *times_ms, one.orientation])
+        writer.writerow([*label.values(), *values, *counts, *times_ms, one.orientation, one.reason or ""])
 
 
 def _colmap_values(cam_from_world: pycolmap.Rigid3d) -> list[float]:

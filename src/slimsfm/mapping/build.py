@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 from slimsfm.devices import Device
 from slimsfm.errors import InputError, ReconstructionError
@@ -13,7 +14,7 @@ from slimsfm.features import Extractor, load_extractor
 from slimsfm.geometry import Box
 from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
-from slimsfm.mapping.extraction import guess_cameras
+from slimsfm.mapping.extraction import Extracted, check_readable, extract_features, guess_cameras
 from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.keypoint_model import build_from_keypoints
 from slimsfm.mapping.map import Map
@@ -22,8 +23,10 @@ from slimsfm.mapping.model import estimate_box, read_box
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.sfm import colmap_warnings
 from slimsfm.mapping.support import measure
-from slimsfm.mapping.work import BuildOptions, BuildWork, KnownPoses, MapParts, ModelBuilder
+from slimsfm.mapping.work import BuildOptions, BuildWork, KnownPoses, MapParts, ModelBuilder, build_key
+from slimsfm.mapping.workspace import Workspace
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.skipping import SkippedPhotos
 
 
 def build_map(
@@ -36,7 +39,8 @@ def build_map(
 ) -> Map:
     """Build a map from a folder of photos by Structure from Motion.
 
-    Photos that could not be registered are named in `Map.unregistered`, and what was skipped or ignored in
+    Photos that cannot be read are skipped with a warning, unless `BuildOptions.strict` is set. Photos that
+    could not be registered are named in `Map.unregistered`, and what was skipped or ignored in
     `MapInfo.notes`. The map reads its features from disk when they are needed, so that large maps fit into
     memory.
 
@@ -44,39 +48,78 @@ def build_map(
         images: Folder. All images in it and its subfolders are used or, with known poses, those with a pose.
         options: How to build.
         known: Known poses: points are triangulated and nothing else is estimated.
-        workspace: Folder that keeps the intermediate files: COLMAP's database, model and the features. By
+        workspace: Folder that keeps the intermediate files: COLMAP's database, model and the features. An
+            equal call goes on from those that an interrupted one left; another call starts afresh. By
             default a temporary folder that is removed.
         progress: Progress callback.
 
     Raises:
-        InputError: The folder, an image, a mask or the box cannot be used.
+        InputError: The folder, a mask or the box cannot be used, or fewer than two images can.
         ReconstructionError: The images give no model.
     """
     images = Path(images)
     found = None if known else find_photos(images, options.masks)
     names = list(found.names) if found else sorted(known.cam_from_world if known else ())
     notes = found.notes if found else ()
-    if len(names) < 2:
-        few = f"{images}: holds {len(names)} image; a map needs at least two"
-        raise InputError("; ".join([few, *notes]))
+    _check_enough(images, names, notes)
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
-    exifs = {} if known else {name: read_exif(images / name) for name in names}
-    notes = (*notes, *ignored_values(exifs))
+    photos = MaskedPhotos(images, names, options.masks, options.alpha, options.orientation)
+    skipped = SkippedPhotos(images, strict=options.strict)
+    exifs = {} if known else _read_exifs(images, names, skipped)
+    guess_cameras(exifs, options.camera, options.orientation)  # fails before the long work
     with _opened(workspace) as folder, colmap_warnings():
-        work = _work(images, names, folder, exifs, known, options, progress)
+        space = Workspace(folder, build_key(images, names, photos, extractor, options, known))
+        extracted = _extract(photos, skipped.left(names), extractor, space, skipped, progress)
+        names = skipped.left(names)
+        notes = (*notes, *skipped.notes)
+        _check_enough(images, names, notes)
+        photos.keep(names)
+        exifs = {name: exifs[name] for name in names} if exifs else {}
+        work = _work(images, photos, names, space, exifs, known, options, progress)
+        notes = (*notes, *ignored_values(exifs))
         try:
-            parts = _build(work, extractor, options)
+            parts = _build(work, extracted, extractor, options)
         except ReconstructionError as error:  # what was skipped may be the reason
-            raise ReconstructionError("; ".join([str(error), *notes, *work.photos.notes])) from error
-    notes = (*notes, *work.photos.notes, *(parts.picked.notes if parts.picked else ()))
+            raise ReconstructionError("; ".join([str(error), *notes, *photos.notes])) from error
+    notes = (*notes, *photos.notes, *(parts.picked.notes if parts.picked else ()))
     return with_global_descriptors(_map(parts, work, exifs, given_box, notes, options))
+
+
+def _check_enough(images: Path, names: list[str], notes: tuple[str, ...]) -> None:
+    if len(names) < 2:
+        few = f"{images}: holds {len(names)} image{'s' * (not names)}; a map needs at least two"
+        raise InputError("; ".join([few, *notes]))
+
+
+def _read_exifs(images: Path, names: list[str], skipped: SkippedPhotos) -> dict[str, Exif]:
+    exifs = {}
+    for name in names:
+        with skipped.skipping(name):
+            exifs[name] = read_exif(images / name)
+    return exifs
+
+
+def _extract(
+    photos: MaskedPhotos,
+    names: list[str],
+    extractor: Extractor,
+    workspace: Workspace,
+    skipped: SkippedPhotos,
+    progress: ProgressBar,
+) -> Extracted | None:
+    """Extract features or, for an extractor that finds no keypoints, only find out what can be read."""
+    if not isinstance(extractor, ModelBuilder):
+        return extract_features(photos, names, extractor, workspace, skipped, progress)
+    check_readable(photos, names, skipped)
+    return None
 
 
 def _work(
     images: Path,
+    photos: MaskedPhotos,
     names: list[str],
-    workspace: Path,
+    workspace: Workspace,
     exifs: Mapping[str, Exif],
     known: KnownPoses | None,
     options: BuildOptions,
@@ -85,25 +128,27 @@ def _work(
     guessed = guess_cameras(exifs, options.camera, options.orientation)
     return BuildWork(
         images=images,
-        photos=MaskedPhotos(images, names, options.masks, options.alpha, options.orientation),
+        photos=photos,
         names=names,
         workspace=workspace,
-        cameras=known.cameras if known else guessed.by_name,
+        cameras={name: known.cameras[name] for name in names} if known else guessed.by_name,
         turned=guessed.turned,
         known=known,
         progress=progress,
     )
 
 
-def _build(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
-    if not isinstance(extractor, ModelBuilder):
-        return build_from_keypoints(work, extractor, options)
+def _build(
+    work: BuildWork, extracted: Extracted | None, extractor: Extractor, options: BuildOptions
+) -> MapParts:
+    if extracted is not None:
+        return build_from_keypoints(work, extracted, extractor, options)
     if work.turned and options.camera == "shared":
         raise InputError(
             f"{min(work.turned)}: width and height are swapped, and without a detector such images cannot "
             "share a camera with the others; use `camera='auto'`"
         )
-    return extractor.build_model(work, options)
+    return cast(ModelBuilder, extractor).build_model(work, options)
 
 
 def _map(

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,11 +11,13 @@ from jaxtyping import UInt8
 
 from slimsfm.errors import InputError
 from slimsfm.exif import Exif
-from slimsfm.features import Extractor, image_colors
+from slimsfm.features import Extractor, Features, image_colors
 from slimsfm.features.store import FeatureFile, FeatureWriter
 from slimsfm.mapping.masked_photos import MaskedPhotos
+from slimsfm.mapping.workspace import FEATURES, Workspace, load_arrays, resumed, save_arrays
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar
+from slimsfm.skipping import SkippedPhotos
 
 CameraSharing = Literal["auto", "shared", "per-image"]
 
@@ -83,24 +84,89 @@ def _check_equal_sizes(guesses: Mapping[str, pycolmap.Camera]) -> None:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Extracted:
+    """What was extracted from the photos that could be read."""
+
+    features: FeatureFile
+    """Features by image name."""
+
+    colors: Colors
+    """Color of each feature."""
+
+
 def extract_features(
-    photos: MaskedPhotos, names: list[str], extractor: Extractor, output: Path, progress: ProgressBar
-) -> tuple[FeatureFile, Colors]:
-    """Extract the features of images to a file.
+    photos: MaskedPhotos,
+    names: list[str],
+    extractor: Extractor,
+    workspace: Workspace,
+    skipped: SkippedPhotos,
+    progress: ProgressBar,
+) -> Extracted:
+    """Extract the features of the photos that can be read, except of those that an interrupted build had.
 
     Raises:
-        InputError: An image cannot be read, its mask is unreadable or of another size, or masks leave fewer
-            than two images with pixels.
+        ImageError: No photo can be read or, if `skipped` is strict, one or its mask cannot.
     """
-    colors = {}
+    left = [name for name in names if not _recall(photos, name, workspace)]
+    for name in progress(left, resumed("extract features", len(names) - len(left))):
+        with skipped.skipping(name):
+            _extract(photos, name, extractor, workspace)
+    colors, output = {}, workspace.folder / FEATURES
     with FeatureWriter(output) as writer:
-        for name in progress(names, "extract features"):
-            photo = photos.read(name)
-            features = extractor.extract(photo.image, photo.mask)
-            colors[name] = image_colors(photo.image, features.keypoints)
-            writer.write(name, features)
-    photos.check()
-    return FeatureFile(output), colors
+        for name in skipped.left(names):
+            saved = load_arrays(workspace.extracted(name)) or {}
+            colors[name] = saved["colors"]
+            writer.write(name, _features(saved))
+    return Extracted(features=FeatureFile(output), colors=colors)
+
+
+def _extract(photos: MaskedPhotos, name: str, extractor: Extractor, workspace: Workspace) -> None:
+    photo = photos.read(name)
+    found = extractor.extract(photo.image, photo.mask)
+    arrays = {
+        "keypoints": found.keypoints,
+        "descriptors": found.descriptors,
+        "scores": found.scores,
+        "image_size": np.array(found.image_size),
+        "colors": image_colors(photo.image, found.keypoints),
+        "said": np.array(list(photos.said(name).items()), str).reshape(-1, 2),
+    }
+    if found.frames is not None:
+        arrays["frames"] = found.frames
+    save_arrays(workspace.extracted(name), arrays)
+
+
+def _recall(photos: MaskedPhotos, name: str, workspace: Workspace) -> bool:
+    """Whether an interrupted build has the features of a photo; then also takes over what it said."""
+    saved = load_arrays(workspace.extracted(name))
+    if saved is None:
+        return False
+    photos.recall(name, dict(saved["said"].tolist()))
+    return True
+
+
+def _features(saved: Mapping[str, np.ndarray]) -> Features:
+    width, height = saved["image_size"].tolist()
+    return Features(
+        keypoints=saved["keypoints"],
+        descriptors=saved["descriptors"],
+        scores=saved["scores"],
+        image_size=(width, height),
+        frames=saved.get("frames"),
+    )
+
+
+def check_readable(photos: MaskedPhotos, names: list[str], skipped: SkippedPhotos) -> None:
+    """Skip the photos that cannot be read, for extractors that read them several times.
+
+    Raises:
+        ImageError: As in `extract_features`.
+    """
+    for name in names:
+        with skipped.skipping(name):
+            photos.read(name)
+    skipped.left(names)
 
 
 def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:

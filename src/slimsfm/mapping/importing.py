@@ -30,6 +30,7 @@ from slimsfm.mapping.sources import (
     from_hloc,
     from_images,
 )
+from slimsfm.mapping.subset import keep_images
 from slimsfm.mapping.support import measure
 from slimsfm.mapping.usable_matches import evidence, usable_matches
 from slimsfm.photos import Orientation
@@ -103,7 +104,7 @@ def import_colmap(
 
     Raises:
         ModelError: The model is damaged, or its keypoints are not those of the features.
-        InputError: A file is missing or damaged.
+        InputError: A file is missing or damaged; a few photos may be, whose images are left out.
     """
     model_path = Path(model_path)
     if images is not None:
@@ -116,6 +117,8 @@ def import_colmap(
     notes += check_reprojection(model, posed, model_path)
     source = _find_source(model_path, posed, options, progress)
     check_extractor(source)
+    if options.images:  # without the images whose photo cannot be read
+        posed = [image for image in posed if image.name in source.features]
     features, more = _fitting_features(posed, source, unusable)
     matches, left_out = usable_matches(source, posed, features, unusable)
     info = MapInfo(
@@ -127,10 +130,12 @@ def import_colmap(
         quality=_quality(model, evidence(source, posed, features, matches)) if matches else None,
         notes=(*notes, *source.notes, *more, *left_out),
         orientation=options.orientation,
-        exif_orientations=_tags(model, options),
-        devices=_devices(model, options),
+        exif_orientations=_tags(posed, options),
+        devices=_devices(model, posed, options),
     )
-    return with_global_descriptors(Map(model=model, features=features, matches=matches, info=info))
+    whole = Map(model=model, features=features, matches=matches, info=info)
+    is_whole = len(whole.images) == len(posed)
+    return with_global_descriptors(whole if is_whole else keep_images(whole, [one.name for one in posed]))
 
 
 def _quality(model: pycolmap.Reconstruction, matches: Matches) -> ModelQuality:
@@ -138,17 +143,19 @@ def _quality(model: pycolmap.Reconstruction, matches: Matches) -> ModelQuality:
     return replace(quality, focal_origins=dict.fromkeys(quality.focal_lengths, "model"))
 
 
-def _tags(model: pycolmap.Reconstruction, options: ImportOptions) -> dict[str, int]:
+def _tags(images: list[pycolmap.Image], options: ImportOptions) -> dict[str, int]:
     if options.orientation == "stored" or options.images is None:
         return {}
-    tags = {image.name: read_orientation(options.images / image.name) for image in _posed_images(model)}
+    tags = {image.name: read_orientation(options.images / image.name) for image in images}
     return {name: tag for name, tag in tags.items() if tag != 1}
 
 
-def _devices(model: pycolmap.Reconstruction, options: ImportOptions) -> dict[int, Device]:
+def _devices(
+    model: pycolmap.Reconstruction, images: list[pycolmap.Image], options: ImportOptions
+) -> dict[int, Device]:
     if options.images is None:
         return {}
-    names = [image.name for image in _posed_images(model)]
+    names = [image.name for image in images]
     return devices_by_camera(model, {name: read_device(options.images / name) for name in names})
 
 

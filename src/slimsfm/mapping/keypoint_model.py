@@ -1,4 +1,4 @@
-"""Build a model from keypoints: extract, match, reconstruct."""
+"""Build a model from keypoints: match, reconstruct."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,7 +10,7 @@ from slimsfm.errors import ReconstructionError
 from slimsfm.features import Extractor, Features, load_matcher
 from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.diagnosis import diagnose
-from slimsfm.mapping.extraction import color_points, extract_features
+from slimsfm.mapping.extraction import Extracted, color_points
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
 from slimsfm.mapping.pairs import choose_pairs, match_pairs_with, verify_pairs
 from slimsfm.mapping.reconstruction import reconstruct
@@ -18,19 +18,21 @@ from slimsfm.mapping.scratch import match_pairs, put_keypoints, verified_matches
 from slimsfm.mapping.sfm import triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.work import BuildOptions, BuildWork, MapParts
+from slimsfm.mapping.workspace import DATABASE, SFM
 
 _FEW = 0.5  # share of the photos below which a map needs an explanation
 
 
-def build_from_keypoints(work: BuildWork, extractor: Extractor, options: BuildOptions) -> MapParts:
-    """Extract and match keypoints, and reconstruct a model of them.
+def build_from_keypoints(
+    work: BuildWork, extracted: Extracted, extractor: Extractor, options: BuildOptions
+) -> MapParts:
+    """Match keypoints, and reconstruct a model of them.
 
     Raises:
-        InputError: A photo, a mask or an option cannot be used.
+        InputError: An option cannot be used.
         ReconstructionError: The images give no model; says what they lack.
     """
-    output, names = work.workspace / "features.h5", work.names
-    features, colors = extract_features(work.photos, names, extractor, output, work.progress)
+    features = extracted.features
     sideways = TurnedFeatures(features, dict.fromkeys(work.turned, 1))
     shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
     database = _match(work, features, shrunk, options)
@@ -42,18 +44,18 @@ def build_from_keypoints(work: BuildWork, extractor: Extractor, options: BuildOp
         turns_back = {image.name: -int(image.name in work.turned) for image in model.images.values()}
         model = turned_model(model, turns_back)
         put_keypoints(model, features)
-    color_points(model, colors)
+    color_points(model, extracted.colors)
     return MapParts(extractor=extractor, model=model, features=features, matches=matches, picked=picked)
 
 
 def _triangulate(work: BuildWork, database: Path, options: BuildOptions) -> pycolmap.Reconstruction:
     poses = work.known.cam_from_world if work.known else {}
-    sfm = work.workspace / "sfm"
+    sfm = work.workspace.folder / SFM
     return triangulate(database, work.names, sfm, poses, seed=options.seed, progress=work.progress)
 
 
 def _reconstruct(work: BuildWork, database: Path, shrunk: ShrunkImages, options: BuildOptions) -> PickedModel:
-    names, sfm, seed = work.names, work.workspace / "sfm", options.seed
+    names, sfm, seed = work.names, work.workspace.folder / SFM, options.seed
     split = options.camera == "auto"  # otherwise the user knows
     try:
         models = reconstruct(database, names, sfm, seed=seed, split=split, progress=work.progress)
@@ -80,13 +82,17 @@ def _lacking(work: BuildWork, database: Path, shrunk: ShrunkImages) -> str:
 def _match(
     work: BuildWork, features: Mapping[str, Features], shrunk: ShrunkImages, options: BuildOptions
 ) -> Path:
-    database = work.workspace / "database.db"
-    write_database(database, shrunk.features, shrunk.cameras)
     names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
+
+    def write(database: Path) -> None:
+        write_database(database, shrunk.features, shrunk.cameras)
+
     if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
+        database = work.workspace.database(names, write)
         match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)
-    else:
-        matcher = load_matcher(options.matcher, options.extractor)
-        matches = match_pairs_with(matcher, features, pairs, work.progress)
-        verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
+        return database
+    matcher = load_matcher(options.matcher, options.extractor)
+    matches = match_pairs_with(matcher, features, pairs, work.workspace, work.progress)
+    write(database := work.workspace.folder / DATABASE)
+    verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
     return database

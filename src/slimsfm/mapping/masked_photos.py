@@ -8,6 +8,7 @@ features either, unless they are told to.
 """
 
 from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -67,8 +68,9 @@ class MaskedPhotos:
         """
         self._folder, self._names, self._alpha = folder, names, alpha
         self._orientation: Orientation = orientation
-        self._masks: dict[str, Path] = {}
-        self._said: dict[str, set[str]] = defaultdict(set)
+        self._mask_folder, self._masks = masks, dict[str, Path]()
+        self._said: dict[str, dict[str, str]] = defaultdict(dict)  # by photo: what, of which file
+        self._unused_masks: set[str] = set()
         if masks is not None:
             self._find(Path(masks))
 
@@ -80,22 +82,39 @@ class MaskedPhotos:
         """
         photo = read_photo(self._folder / name, self._orientation, warn=False)
         if photo.num_frames > 1:
-            self._said["photo(s) of several frames or pages, of which the first is used"].add(name)
-        mask = self._mask(name, photo)
+            self._said[name]["photo(s) of several frames or pages, of which the first is used"] = name
+        try:
+            mask = self._mask(name, photo)
+        except ImageError as error:
+            told = str(error).removeprefix(f"{self._mask_folder}/")
+            raise ImageError(f"{self._folder / name}: its mask {told}") from error
         if photo.alpha is not None and self._alpha == "mask":
-            self._said["photo(s) with transparent pixels, which hold no features"].add(name)
+            self._said[name]["photo(s) with transparent pixels, which hold no features"] = name
             mask = photo.alpha if mask is None else mask & photo.alpha
         if mask is not None and not mask.any():
-            self._said[_EMPTY].add(name)
+            self._said[name][_EMPTY] = name
         return MaskedPhoto(image=photo.image, mask=mask)
 
-    def check(self) -> None:
-        """Check, once all photos were read, that at least two have pixels that are kept.
+    def files_of(self, name: str) -> tuple[Path, ...]:
+        """The files of a photo: itself and, if it has one, its mask."""
+        return tuple(path for path in (self._folder / name, self._masks.get(name)) if path)
+
+    def said(self, name: str) -> dict[str, str]:
+        """What is to be said about a photo that was read: sentences, and the file that each is about."""
+        return self._said[name]
+
+    def recall(self, name: str, said: Mapping[str, str]) -> None:
+        """Take what an earlier process said about a photo for said, so that it need not be read again."""
+        self._said[name] |= said
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Forget all photos but these, which could be read, and check that two of them have pixels to keep.
 
         Raises:
             InputError: They have not.
         """
-        empty = self._said[_EMPTY]
+        self._names = list(names)
+        empty = [name for name in self._names if _EMPTY in self._said[name]]
         if len(self._names) - len(empty) < 2 <= len(self._names):
             raise InputError(
                 f"{named(_EMPTY, empty)}; a map needs at least two photos with pixels to keep: in a mask "
@@ -106,7 +125,12 @@ class MaskedPhotos:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences, with names, on masks without a photo, photos without a mask, transparency and frames."""
-        return tuple(named(what, names) for what, names in sorted(self._said.items()) if names)
+        files = defaultdict(set)
+        for name in self._names:
+            for what, file in self._said[name].items():
+                files[what].add(file)
+        files["mask(s) of no photo ignored"] = self._unused_masks
+        return tuple(named(what, some) for what, some in sorted(files.items()) if some)
 
     def _find(self, masks: Path) -> None:
         if not masks.is_dir():
@@ -119,14 +143,13 @@ class MaskedPhotos:
             candidates = (masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png"))
             path = next((path for path in candidates if path.is_file()), None)
             if path is None:
-                self._said["photo(s) without a mask, used whole"].add(name)
+                self._said[name]["photo(s) without a mask, used whole"] = name
             else:
                 self._masks[name] = path
         if not self._masks:
             raise InputError(_no_mask(masks, self._names[0]))
         used = set(self._masks.values())
-        others = {name for name in find_images(masks).names if masks / name not in used}
-        self._said["mask(s) of no photo ignored"] = others
+        self._unused_masks = {one for one in find_images(masks).names if masks / one not in used}
 
     def _mask(self, name: str, photo: Photo) -> GrayImage | None:
         path, shape = self._masks.get(name), photo.image.shape[:2]
@@ -141,7 +164,9 @@ class MaskedPhotos:
             turned = (as_stored if is_stored else upright)(mask, photo.orientation)
             if mask.shape == turned.shape == shape:
                 as_read = f"mask(s) taken as {self._orientation}"
-                self._said[f"{as_read}, because their photo is turned and they fit both ways"].add(path.name)
+                self._said[name][f"{as_read}, because their photo is turned and they fit both ways"] = (
+                    path.name
+                )
             elif turned.shape == shape:
                 mask = turned
         if mask.shape != shape:

@@ -14,6 +14,7 @@ from jaxtyping import Float32, Int64
 from slimsfm.arrays import IndexPairs
 from slimsfm.features import Features, Matcher, unit_rows
 from slimsfm.features.nearest import learn_words, vlad
+from slimsfm.mapping.workspace import Workspace
 from slimsfm.progress import ProgressBar, silent, single_step
 
 Pairs = list[tuple[str, str]]
@@ -87,16 +88,16 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 
 
 def match_pairs_with(
-    matcher: Matcher, features: Mapping[str, Features], pairs: Pairs, progress: ProgressBar = silent
+    matcher: Matcher,
+    features: Mapping[str, Features],
+    pairs: Pairs,
+    workspace: Workspace,
+    progress: ProgressBar = silent,
 ) -> dict[tuple[str, str], IndexPairs]:
     """Match pairs of images by their features; pairs without a match are omitted."""
     read = lru_cache(_CACHED)(features.__getitem__)
-    found = {}
-    for a, b in progress(pairs, "match pairs"):
-        matches = matcher.match(read(a), read(b))
-        if len(matches):
-            found[a, b] = matches
-    return found
+    found = workspace.match(pairs, lambda a, b: matcher.match(read(a), read(b)), progress, "match pairs")
+    return {pair: matches for pair, matches in found.items() if len(matches)}
 
 
 def verify_pairs(

@@ -21,6 +21,7 @@ from slimsfm.mapping.agreement import counted
 from slimsfm.mapping.model import camera_of, positions
 from slimsfm.photos import Orientation, read_image
 from slimsfm.progress import ProgressBar
+from slimsfm.skipping import SkippedPhotos
 
 _REACH_PX = 2.0
 _MIN_DESCRIBED = 0.2  # share of observations; with fewer, detector or images are others
@@ -35,24 +36,33 @@ def redescribe(
 ) -> tuple[dict[str, Features], Sift, list[str]]:
     """Describe the keypoints of a model's images by SIFT.
 
-    Photos may all be larger or smaller than the images of the model by one factor.
+    Photos may all be larger or smaller than the images of the model by one factor. Those that are missing or
+    unreadable are skipped with a warning if they are less than half of all.
 
     Returns:
-        The features by image name, the extractor for queries, and notes.
+        The features by name of the images that were read, the extractor for queries, and notes.
 
     Raises:
-        ImageError: An image is missing, unreadable or of other proportions than its camera.
+        ImageError: Half of the images cannot be read, or one has other proportions than its camera.
         ModelError: Fewer than 20 % of the keypoints that observe a point could be described, or in some
             images far fewer than in the others. All such images are named.
     """
     extractor, features, scales = Sift(), {}, (0.0, np.inf)
+    skipped = SkippedPhotos(folder)
     for image in progress(images, "describe keypoints"):
-        path = folder / image.name
-        pixels, camera = read_image(path, orientation), camera_of(image)
+        path, camera, pixels = folder / image.name, camera_of(image), None
+        with skipped.skipping(image.name):
+            pixels = read_image(path, orientation)
+        if pixels is None:
+            continue
         _check_turn(pixels, camera, path, orientation)
         scales = _common_scales(scales, pixels, camera, path)
         features[image.name] = _redescribe_image(image, _resized(pixels, camera), extractor)
-    notes = [_check_shares(images, features, folder)]
+    skipped.left(image.name for image in images)
+    if 2 * len(features) <= len(images):
+        few = f"{folder}: only {len(features)} of the {len(images)} images of the model can be used"
+        raise ImageError("; ".join([few, *skipped.notes]))
+    notes = [*skipped.notes, _check_shares([one for one in images if one.name in features], features, folder)]
     if scales != _SAME:
         notes.append(
             f"{folder.name}: the images are {sum(scales) / 2:.3g} times as large as those of the model; "

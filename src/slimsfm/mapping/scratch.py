@@ -10,6 +10,7 @@ from jaxtyping import Float32
 from slimsfm.arrays import IndexPairs
 from slimsfm.features import Features
 from slimsfm.mapping.pairs import Pairs
+from slimsfm.mapping.workspace import resumed
 from slimsfm.progress import ProgressBar, counted, silent
 
 _JITTER_PX, _ON_GRID = 0.05, 1e-3  # pixels
@@ -112,15 +113,20 @@ def put_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Feature
 def match_pairs(
     database: Path, names: list[str], pairs: Pairs, *, seed: int, progress: ProgressBar = silent
 ) -> None:
-    """Match pairs of images by their SIFT descriptors and verify the matches by two-view geometry."""
+    """Match pairs of images by their SIFT descriptors and verify the matches by two-view geometry.
+
+    Pairs whose verified matches the database already has stay as they are.
+    """
     ids = {name: image_id for image_id, name in enumerate(names, start=1)}
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = database.with_suffix(".pairs.txt")
-    with counted(progress, len(pairs), "match pairs") as advance_to:
-        for start in range(0, len(pairs), _BLOCK):
-            block = pairs[start : start + _BLOCK]
+    with pycolmap.Database.open(database) as opened:
+        left = [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]
+    with counted(progress, len(left), resumed("match pairs", len(pairs) - len(left))) as advance_to:
+        for start in range(0, len(left), _BLOCK):
+            block = left[start : start + _BLOCK]
             Path(pairing.match_list_path).write_text("".join(f"{ids[a]} {ids[b]}\n" for a, b in block))
             pycolmap.match_image_pairs(
                 database,

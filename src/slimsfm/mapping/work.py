@@ -1,10 +1,12 @@
 """What a model is built from, and what building it gives."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from importlib.metadata import version
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import cv2
 import pycolmap
 
 from slimsfm.arrays import Image
@@ -15,8 +17,10 @@ from slimsfm.mapping.choice import PickedModel
 from slimsfm.mapping.extraction import CameraSharing
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
 from slimsfm.mapping.pairs import Matches, PairChoice
+from slimsfm.mapping.workspace import Workspace
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar
+from slimsfm.weights import chosen_runtime
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +69,9 @@ class BuildOptions:
     seed: int = 0
     """Seed of every random choice."""
 
+    strict: bool = False
+    """Stop at the first photo that cannot be read, instead of skipping it."""
+
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
@@ -94,6 +101,42 @@ class KnownPoses:
                 raise ValueError(f"cameras must be possible, but that of {name!r} is not: {fault}")
 
 
+def build_key(
+    images: Path,
+    names: list[str],
+    photos: MaskedPhotos,
+    extractor: Extractor,
+    options: BuildOptions,
+    known: KnownPoses | None,
+) -> dict[str, Any]:
+    """All that features and matches depend on: photos and masks, options, known poses, and versions."""
+    files = [path for name in names for path in photos.files_of(name)]
+    chosen = {field.name: getattr(options, field.name) for field in fields(options)}
+    later = ("box", "model", "strict", "masks")  # masks count as files
+    return {
+        "versions": [version("slimsfm"), pycolmap.__version__, cv2.__version__],
+        "images": [str(images.resolve()), *names],
+        "files": [[str(path), *_stamp(path)] for path in files],
+        "extractor": [extractor.name, repr(extractor.options), repr(chosen_runtime())],
+        "options": {name: value for name, value in chosen.items() if name not in later},
+        "known": known and [[name, _text(known, name)] for name in names],
+    }
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size and time of modification of a file; zeros if it cannot be read."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_size, found.st_mtime_ns
+
+
+def _text(known: KnownPoses, name: str) -> str:
+    pose = known.cam_from_world[name].matrix().tolist()
+    return f"{known.cameras[name].todict()} {pose}"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BuildWork:
     """What a model is built from."""
@@ -105,10 +148,10 @@ class BuildWork:
     """The photos with their masks."""
 
     names: list[str]
-    """Names of the photos to use, relative to the folder."""
+    """Names of the photos to use, relative to the folder; all of them can be read."""
 
-    workspace: Path
-    """Folder for intermediate files."""
+    workspace: Workspace
+    """Intermediate files."""
 
     cameras: Mapping[str, pycolmap.Camera]
     """Intrinsics by image name; images with equal `camera_id` share a camera."""

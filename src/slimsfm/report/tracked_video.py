@@ -1,8 +1,8 @@
 """Tracking an object through a video, and the video with the object's box drawn in."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -32,6 +32,9 @@ class TrackedVideo:
     frames: dict[str, Tracked]
     """The outcome of each frame, by the name of the frame, in the order of the frames."""
 
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    """Why images of a folder were skipped, by name."""
+
     ended_early: str | None = None
     """Why the video could not be read to its end; None where it was."""
 
@@ -44,12 +47,14 @@ def track_video(
     camera: pycolmap.Camera | None = None,
     video: str | Path | None = None,
     overwrite: bool = False,
+    strict: bool = False,
     progress: FrameProgress = lambda frames: frames.pictures,
 ) -> TrackedVideo:
     """Track an object through all frames of a video.
 
     An interruption ends the frames of a live camera, damage or a change of size those of a video file, and
-    what was tracked is returned.
+    what was tracked is returned. Images of a folder that cannot be read or have another size than the first
+    are skipped.
 
     Args:
         localizer: Localizer of the map.
@@ -59,21 +64,22 @@ def track_video(
             first pose is kept.
         video: Where to write the video with the object's box. The fainter the box, the less sure the pose.
         overwrite: Whether to replace an existing `video`.
+        strict: Whether an image that cannot be used or a video that cannot be read to its end is an error.
         progress: Progress callback.
 
     Returns:
         The outcome of each frame.
 
     Raises:
-        InputError: The source cannot be read or has no frame, its focal length must be known but is not, or
-            the images of a folder differ in size.
+        InputError: The source cannot be read or has no frame, its focal length must be known but is not; or,
+            if `strict`, an image or the end of the video cannot be read.
         OutputError: The video cannot be written.
     """
     source, tracker = str(source), Tracker(localizer, options)
-    frames = open_frames(source, localizer.map.info.orientation)
+    frames = open_frames(source, localizer.map.info.orientation, strict=strict)
     rate = frames.frames_per_second
     with write_video(Path(video), rate, overwrite=overwrite) if video else nullcontext() as write:
-        return _track_all(localizer, tracker, source, frames, camera, write, progress)
+        return _track_all(localizer, tracker, source, frames, camera, write, progress, strict=strict)
 
 
 def draw_tracked(image: Image, tracked: Tracked, box: Box) -> Image:
@@ -101,6 +107,8 @@ def _track_all(
     given: pycolmap.Camera | None,
     write: Callable[[Image], None] | None,
     progress: FrameProgress,
+    *,
+    strict: bool,
 ) -> TrackedVideo:
     """Track and write frame by frame.
 
@@ -111,20 +119,22 @@ def _track_all(
     try:
         for frame in progress(frames):
             camera = camera or _camera_of(localizer, source, frame, given)
-            _check_size(frame, camera.camera)
             with uninterrupted() if frames.is_live else nullcontext():
                 tracked = replace(tracker.track(frame.image, camera), frame_seconds=frame.seconds)
                 results[frame.name] = tracked
                 if write:
                     write(draw_tracked(frame.image, tracked, localizer.map.box))
     except VideoError as error:
+        if strict or not results:
+            raise
         ended_early = str(error)
     except KeyboardInterrupt:
         if not (frames.is_live and results):
             raise
     if not results:
         raise InputError("the video has no frames")
-    return TrackedVideo(frames=results, ended_early=ended_early)
+    skipped = frames.skipped.reasons if frames.skipped else {}
+    return TrackedVideo(frames=results, skipped=skipped, ended_early=ended_early)
 
 
 def _camera_of(
@@ -147,12 +157,3 @@ def _camera_of(
             f"{source}: {width}x{height} pixels, focal length unknown; give `camera=FILE` of this video"
         )
     return found
-
-
-def _check_size(frame: VideoFrame, camera: pycolmap.Camera) -> None:
-    height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise InputError(
-            f"frame {frame.name} has {width}x{height} pixels, the first {camera.width}x{camera.height}; "
-            "all frames must have one size"
-        )

@@ -23,6 +23,7 @@ from slimsfm.tracking.track import MAX_CORNER_ERROR, Track
 _MAX_ERROR_PX = 6.0  # of a point that supports the second pose
 _MIN_ERROR_PX = 0.25  # to expect of a right pose
 _FITS = 2.0  # times the error of the first pose, within which the second one cannot be ruled out
+_UNSURE = "the pose is not sure enough to begin a track"
 _DIFFERENT = 0.05  # corner error, over the diagonal, at which two poses are different
 
 
@@ -65,12 +66,13 @@ class Relocalizer:
         exact = found.camera_estimated or (found.predicted_corner_error or 0.0) <= MAX_CORNER_ERROR
         if sure and exact:
             return found
-        return replace(found, pose=None, predicted_corner_error=None)
+        return replace(found, pose=None, reason=found.reason or _UNSURE, predicted_corner_error=None)
 
 
 def _nothing(camera: QueryCamera) -> Localization:
     return Localization(
         pose=None,
+        reason="the object is lost, and this frame was not searched",
         camera=camera.camera,
         camera_source=camera.source,
         points2D=np.zeros((0, 2)),

@@ -190,7 +190,8 @@ class Tracker:
     def _unambiguous(self, found: Localization) -> Localization:
         """The localization, without its pose if that is only one of two."""
         if found.pose and self._is_ambiguous(found, found.pose):
-            return replace(found, pose=None, predicted_corner_error=None)
+            reason = "the matches agree with two poses"
+            return replace(found, pose=None, reason=reason, predicted_corner_error=None)
         return found
 
     def _is_ambiguous(self, found: Localization, pose: PoseEstimate) -> bool:

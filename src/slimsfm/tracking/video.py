@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 
 from slimsfm.arrays import Image
-from slimsfm.errors import InputError, OutputError
+from slimsfm.errors import ImageError, InputError, OutputError, VideoError
 from slimsfm.files import replacing
 from slimsfm.image_files import list_images
 from slimsfm.photos import Orientation, read_image
+from slimsfm.skipping import SkippedPhotos
 from slimsfm.tracking.film import film_pictures, open_film, pyav
 
 VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
@@ -48,8 +49,8 @@ class FrameSource:
     """Frames in the order in which they were taken."""
 
     pictures: Generator[VideoFrame]
-    """Generator of the frames; closing it releases the file or camera. It ends with a `VideoError` where a
-    video is damaged or cut off or changes its size."""
+    """Generator of the frames, all of one size; closing it releases the file or camera. It ends with a
+    `VideoError` where a video is damaged or cut off or changes its size."""
 
     count: int | None
     """Number of frames; None where it is not known in advance."""
@@ -60,21 +61,28 @@ class FrameSource:
     is_live: bool
     """Whether the frames come from a camera and continue until stopped."""
 
+    skipped: SkippedPhotos | None = None
+    """The images of a folder that were skipped so far, because they cannot be used; None if it is none."""
 
-def open_frames(source: str | Path, orientation: Orientation = "upright") -> FrameSource:
+
+def open_frames(
+    source: str | Path, orientation: Orientation = "upright", *, strict: bool = False
+) -> FrameSource:
     """Open a video file, a folder of images, or a camera by its index.
 
     Images are read upright or as they are stored, as `orientation` says; videos are always read as a
-    player shows them: in square pixels, rotated and mirrored as the file says.
+    player shows them: in square pixels, rotated and mirrored as the file says. Images of a folder that cannot
+    be read or differ in size from the first are skipped with a warning, unless `strict` is set.
 
     Raises:
         InputError: The file, folder or camera does not exist or contains no image.
     """
     source, path = str(source), Path(source)
     if path.is_dir():
-        names = list_images(path)
+        names, skipped = list_images(path), SkippedPhotos(path, strict=strict)
         return FrameSource(
-            pictures=_images(path, names, orientation),
+            pictures=_images(path, names, orientation, skipped),
+            skipped=skipped,
             count=len(names),
             frames_per_second=_DEFAULT_RATE,
             is_live=False,
@@ -84,9 +92,24 @@ def open_frames(source: str | Path, orientation: Orientation = "upright") -> Fra
     return _open_video(path)
 
 
-def _images(folder: Path, names: list[str], orientation: Orientation) -> Generator[VideoFrame]:
+def _images(
+    folder: Path, names: list[str], orientation: Orientation, skipped: SkippedPhotos
+) -> Generator[VideoFrame]:
+    size = None
     for name in names:
-        yield VideoFrame(name=name, image=read_image(folder / name, orientation))
+        image = None
+        with skipped.skipping(name):
+            image = read_image(folder / name, orientation)
+            size = size or _size(image)
+            if _size(image) != size:
+                raise ImageError(f"{folder / name}: has {_size(image)} pixels, the frames before {size}")
+        if image is not None and name not in skipped.reasons:
+            yield VideoFrame(name=name, image=image)
+    skipped.left(names)
+
+
+def _size(image: Image) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def _open_camera(index: int) -> FrameSource:
@@ -109,7 +132,7 @@ def _open_camera(index: int) -> FrameSource:
 
 def _captured(capture) -> Generator[VideoFrame]:
     try:
-        start = None
+        start = size = None
         for index in count():
             ok, bgr = capture.read()
             if not ok:
@@ -117,6 +140,8 @@ def _captured(capture) -> Generator[VideoFrame]:
             now = perf_counter()
             start = now if start is None else start
             image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+            if _size(image) != (size := size or _size(image)):
+                raise VideoError(f"the camera changed its frames from {size} to {_size(image)} pixels")
             yield VideoFrame(name=_name(index), image=image, seconds=now - start)
     finally:
         capture.release()

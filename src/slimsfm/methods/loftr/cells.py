@@ -17,6 +17,7 @@ from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 from slimsfm.arrays import IndexPairs, Points2D
 from slimsfm.features import Features, unmasked
 from slimsfm.mapping.pairs import Matches, Pairs
+from slimsfm.mapping.workspace import Workspace
 from slimsfm.progress import ProgressBar, silent
 
 # Without named sizes, because one call may take several images of different sizes.
@@ -45,6 +46,16 @@ class ImageMatches:
 
     def __len__(self) -> int:
         return len(self.scores)
+
+    def as_rows(self) -> Float64[np.ndarray, "k 5"]:
+        """All matches as rows of an array: both pixels and the score."""
+        return np.column_stack([self.points2D_1, self.points2D_2, self.scores])
+
+    @classmethod
+    def of_rows(cls, rows: Float64[np.ndarray, "k 5"]) -> "ImageMatches":
+        """The matches of such rows."""
+        scores = rows[:, 4].astype(np.float32)
+        return cls(points2D_1=rows[:, :2], points2D_2=rows[:, 2:4], scores=scores)
 
 
 @runtime_checkable
@@ -129,6 +140,7 @@ def match_without_keypoints(
     photos: Mapping[str, Photo],
     pairs: Pairs,
     matcher: ImageMatcher,
+    workspace: Workspace,
     masks: Mapping[str, PhotoMask] | None = None,
     progress: ProgressBar = silent,
 ) -> CellKeypoints:
@@ -138,14 +150,19 @@ def match_without_keypoints(
         photos: Photos by name, read on access.
         pairs: Pairs of names.
         matcher: Matches the photos.
+        workspace: Keeps matches, and has those of an interrupted build.
         masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
         progress: Progress callback.
     """
     encode = lru_cache(_CACHED)(lambda name: matcher.encode(photos[name], cells_only=True))
-    found = {}
-    for a, b in progress(in_tiles(pairs, _CACHED // 2), "match images"):
+
+    def match(a: str, b: str) -> np.ndarray:
         matches = matcher.match_cells(encode(a), encode(b))
-        found[a, b] = _within(matches, (masks or {}).get(a), (masks or {}).get(b))
+        return _within(matches, (masks or {}).get(a), (masks or {}).get(b)).as_rows()
+
+    tiled = in_tiles(pairs, _CACHED // 2)
+    rows = workspace.match(tiled, match, progress, "match images")
+    found = {pair: ImageMatches.of_rows(some) for pair, some in rows.items()}
     names = sorted(photos)
     cells = _numbered(names, {pair: found[pair] for pair in sorted(found)})
     return CellKeypoints(

@@ -211,9 +211,7 @@ class DetectorFree:
 
 def _masks(work: BuildWork) -> dict[str, GrayImage]:
     read = ((name, work.photos.read(name).mask) for name in work.names)
-    masks = {name: mask for name, mask in read if mask is not None}
-    work.photos.check()
-    return masks
+    return {name: mask for name, mask in read if mask is not None}
 
 
 class PhotoFolder(Mapping[str, Photo]):

@@ -24,6 +24,7 @@ from slimsfm.mapping.reconstruction import reconstruct
 from slimsfm.mapping.scratch import verified_matches, write_database
 from slimsfm.mapping.sfm import adjust, triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
+from slimsfm.mapping.workspace import DATABASE, SFM, Workspace
 from slimsfm.methods.loftr.cells import (
     CellKeypoints,
     EncodedImage,
@@ -226,7 +227,7 @@ def build_without_keypoints(
     pairs: Pairs,
     matcher: ImageMatcher,
     cameras: Mapping[str, pycolmap.Camera],
-    workspace: Path,
+    workspace: Workspace,
     *,
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None = None,
     masks: Mapping[str, PhotoMask] | None = None,
@@ -242,7 +243,7 @@ def build_without_keypoints(
         pairs: Pairs of names to match.
         matcher: Matches the photos.
         cameras: Intrinsics by image name; images with equal `camera_id` share a camera.
-        workspace: Folder for intermediate files.
+        workspace: Intermediate files.
         cam_from_world: Known poses by image name; then poses and cameras are not refined.
         masks: Masks by name, of the same sizes as the photos; cells where a mask is 0 are not matched.
         number: Which model to keep if there are several, from 1, the largest.
@@ -254,9 +255,9 @@ def build_without_keypoints(
         InputError: A photo cannot be used, or there are fewer models.
         ReconstructionError: No model can be reconstructed from the photos.
     """
-    cells = match_without_keypoints(photos, pairs, matcher, masks, progress)
+    cells = match_without_keypoints(photos, pairs, matcher, workspace, masks, progress)
     rough, picked, matches = _reconstruct(
-        cells, cameras, cam_from_world, workspace, number, split, seed, progress
+        cells, cameras, cam_from_world, workspace.folder, number, split, seed, progress
     )
     refined = refine_model(rough, cells, photos, matcher, progress=progress)
     if cam_from_world is None:
@@ -272,7 +273,7 @@ def _reconstruct(
     cells: CellKeypoints,
     cameras: Mapping[str, pycolmap.Camera],
     cam_from_world: Mapping[str, pycolmap.Rigid3d] | None,
-    workspace: Path,
+    folder: Path,
     number: int,
     split: bool,
     seed: int,
@@ -282,7 +283,7 @@ def _reconstruct(
 
     COLMAP's limits are in pixels, so images are scaled until a cell has 8 of them.
     """
-    names, database = sorted(cells.features), workspace / "database.db"
+    names, database = sorted(cells.features), folder / DATABASE
     factors = {name: cells.cell_px[name] / _CELL_PX for name in names}
     shrunk = ShrunkImages(whole=cells.features, whole_cameras=cameras, factors=factors)
     small = shrunk.cameras
@@ -292,9 +293,9 @@ def _reconstruct(
     verify_pairs(database, names, cells.matches, seed=seed, progress=progress)
     picked = None
     if cam_from_world is not None:
-        model = triangulate(database, names, workspace / "sfm", cam_from_world, seed=seed, progress=progress)
+        model = triangulate(database, names, folder / SFM, cam_from_world, seed=seed, progress=progress)
     else:
-        models = reconstruct(database, names, workspace / "sfm", seed=seed, split=split, progress=progress)
+        models = reconstruct(database, names, folder / SFM, seed=seed, split=split, progress=progress)
         picked = pick_model(models, number)
         model = picked.model
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
