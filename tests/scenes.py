@@ -82,6 +82,15 @@ def with_matches(map_: Map) -> Map:
     return replace(map_, matches=matches)
 
 
+def with_shuffled_points(map_: Map) -> Map:
+    """The same map, changed in place, with each point where another was: no pose agrees with its matches."""
+    points = [map_.model.point3D(i) for i in sorted(map_.model.point3D_ids())]
+    places = np.random.default_rng(0).permutation([point.xyz for point in points])
+    for point, xyz in zip(points, places, strict=True):
+        point.xyz = xyz
+    return map_
+
+
 def graph_from_dense(names: tuple[str, ...], errors: np.ndarray) -> ReferenceGraph:
     """The graph with these errors on all pairs of two different images."""
     pairs = np.argwhere(~np.eye(len(names), dtype=bool))

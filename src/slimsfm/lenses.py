@@ -18,7 +18,7 @@ _STRETCHED = 3.0  # pixels per undistorted pixel in the direction in which they 
 _SQUEEZED = 25.0  # area on the sphere of rays, over the area of its pixels
 _LEAST_SOUND = 1 / 3  # of the cells: calibrations are often wrong where no keypoints were
 _LEAST_OF_CIRCLE = 0.05  # of the cells, around a fisheye's image circle
-_WIDE = np.tan(np.radians(60))  # a ray of a fisheye
+_NARROW, _WIDE, _WIDEST = np.tan(np.radians((45, 60, 89.5)))  # rays inside, toward, and at its rim
 
 
 def camera_fault(camera: pycolmap.Camera) -> str | None:
@@ -65,7 +65,7 @@ def _pinhole_fault(camera: pycolmap.Camera, longer_px: int) -> str | None:
         return f"its focal lengths {focal_px[0]:g} and {focal_px[1]:g} differ too much"
     center = camera.params[camera.principal_point_idxs()]
     outside = np.maximum(np.maximum(-center, center - (camera.width, camera.height)), 0) / focal_px
-    if np.linalg.norm(outside) > _MOST_OFF_AXIS:
+    if outside.max() > _MOST_OFF_AXIS:
         return (
             f"its principal point ({center[0]:g}, {center[1]:g}) is too far outside an image of "
             f"{camera.width}x{camera.height}"
@@ -81,8 +81,9 @@ def _distortion_fault(camera: pycolmap.Camera, longer_px: int) -> str | None:
     with np.errstate(all="ignore"):
         rays = _rays(camera, pixels.reshape(-1, 2), _ROUND_TRIP * longer_px).reshape(pixels.shape)
         sound = _is_sound(camera, rays)
-        is_wide = np.nanmax(np.linalg.norm(rays, axis=-1), initial=0) > _WIDE
-    if sound.mean() > (_LEAST_OF_CIRCLE if is_wide else _LEAST_SOUND):
+        off_axis = np.linalg.norm(rays, axis=-1)[:-1, :-1][sound]
+    is_circle = off_axis.min(initial=np.inf) < _NARROW and off_axis.max(initial=0) > _WIDE
+    if sound.mean() > (_LEAST_OF_CIRCLE if is_circle else _LEAST_SOUND):
         return None
     return (
         f"its distortion ({camera.params_to_string()}) folds, stretches or squeezes most of an image of "
@@ -91,10 +92,11 @@ def _distortion_fault(camera: pycolmap.Camera, longer_px: int) -> str | None:
 
 
 def _rays(camera: pycolmap.Camera, pixels: Points2D, most_px: float) -> Points2D:
-    """Where the rays of pixels meet the plane at depth 1; NaN where they do not lead back to their pixels."""
+    """Where the rays of pixels meet the plane at depth 1; NaN where none leads back to its pixel."""
     rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
     back = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))).reshape(-1, 2)
-    return np.where(np.linalg.norm(back - pixels, axis=1, keepdims=True) < most_px, rays, np.nan)
+    errors, off_axis = (np.linalg.norm(one, axis=1, keepdims=True) for one in (back - pixels, rays))
+    return np.where((errors < most_px) & (off_axis < _WIDEST), rays, np.nan)
 
 
 def _is_sound(

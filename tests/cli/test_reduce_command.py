@@ -10,7 +10,7 @@ import pytest
 
 from commands import Outcome, contents, slimsfm
 from rendered import MAPPING_FRAMES
-from scenes import exact_map, with_matches
+from scenes import exact_map, with_matches, with_shuffled_points
 from slimsfm.features import unit_rows
 from slimsfm.geometry import corner_error
 from slimsfm.graph import GraphOptions, compute_graph
@@ -275,3 +275,11 @@ def test_a_removed_selector_is_replaced_with_a_note(small, tmp_path):
             name == "old"
         )
     assert contents(tmp_path / "old") == contents(tmp_path / "new")
+
+
+def test_a_map_that_would_localize_nothing_is_not_written(tmp_path):
+    write_map(with_shuffled_points(exact_map(4)), tmp_path / "map")
+    outcome = slimsfm("reduce", tmp_path / "map", "-o", tmp_path / "slim")
+    assert outcome.code == 2
+    assert "would localize none of 4 images" in outcome.err
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]

@@ -9,6 +9,7 @@ import pytest
 
 from scenes import exact_map
 from slimsfm.errors import MapError, OutputError
+from slimsfm.geometry import Box
 from slimsfm.mapping.info_file import FORMAT_VERSION
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
 from slimsfm.mapping.map import check_map
@@ -112,6 +113,26 @@ def change_info(path, change=dict.copy):
     data.pop("checksums", None)
     change(data)
     (path / "map.json").write_text(json.dumps(data))
+
+
+IMPOSSIBLE_BOXES = {
+    "without extent": {"half_edges": (1e-100 * np.eye(3)).tolist()},
+    "much smaller than the map": {"half_edges": (1e-9 * np.eye(3)).tolist()},
+    "much larger than the map": {"half_edges": (1e12 * np.eye(3)).tolist()},
+    "far away": {"center": [1e200, 0, 0]},
+}
+
+
+@pytest.mark.parametrize("change", IMPOSSIBLE_BOXES.values(), ids=IMPOSSIBLE_BOXES.keys())
+def test_a_map_with_an_impossible_box_is_neither_read_nor_written(exact, written, change, tmp_path):
+    change_info(written, lambda data: data["box"].update(change))
+    with pytest.raises(MapError, match=r"the map cannot be right: its .*box"):
+        read_map(written)
+    values = {"center": exact.box.center, "half_edges": exact.box.half_edges, **change}
+    box = Box(*(np.array(values[name], np.float64) for name in ("center", "half_edges")))
+    with pytest.raises(MapError, match=r"the map cannot be right: its .*box"):
+        write_map(replace(exact, info=replace(exact.info, box=box)), tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
 
 
 def test_a_map_of_a_later_format_asks_to_upgrade(written):

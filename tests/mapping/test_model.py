@@ -205,6 +205,11 @@ WRONG_WORDS = {
     "a point that is no number": ("points3D", 2, "nan"),
     "a focal length of zero": ("cameras", 4, "0"),
     "a negative focal length": ("cameras", 4, "-500"),
+    "a focal length of 1e300": ("cameras", 4, "1e300"),
+    "distortion of 1e9": ("cameras", slice(8, 12), ["1e9"] * 4),
+    "a principal point of 1e5": ("cameras", 6, "1e5"),
+    "a camera at 1e200": ("frames", 6, "1e200"),
+    "a point at 1e200": ("points3D", 1, "-1e200"),
     "a width of zero": ("cameras", 2, "0"),
     "a negative width": ("cameras", 2, "-640"),
     "two images of a name": ("images", 9, "002.png"),
@@ -232,6 +237,15 @@ def test_points_and_poses_that_are_not_finite_are_a_model_error(tmp_path):
     model.point3D(1).xyz = np.array([0.0, np.nan, 0.0])
     model.write_binary(tmp_path)
     with pytest.raises(ModelError, match="not finite"):
+        read_model(tmp_path)
+
+
+def test_points_in_one_place_are_a_model_error(tmp_path):
+    model = small_model()
+    for point in model.points3D.values():
+        point.xyz = np.array([7.0, -3.0, 1e-15])
+    model.write_binary(tmp_path)
+    with pytest.raises(ModelError, match="its 5 points are all in one place"):
         read_model(tmp_path)
 
 

@@ -16,8 +16,8 @@ from slimsfm.pose.camera_fit import (
     misfit,
     with_check,
 )
-from slimsfm.pose.priors import with_two_focal_lengths
-from slimsfm.pose.types import bound_95
+from slimsfm.pose.priors import FramePrior, with_two_focal_lengths
+from slimsfm.pose.types import bound_95, probability_below
 from slimsfm.synthetic.scene import look_at
 
 LENS = camera("SIMPLE_RADIAL")
@@ -114,6 +114,8 @@ def test_a_camera_with_two_focal_lengths_is_equal(model):
     if two is not None:
         assert np.allclose(two.img_from_cam(rays), lens.img_from_cam(rays))
         assert len(two.focal_length_idxs()) == 2
+        expected = FramePrior(camera=lens, center=True, aspect=True)
+        assert np.allclose(expected.rows(seen_from(0, 2.4), two).residuals, 0)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -122,3 +124,7 @@ def test_a_bound_holds_in_95_percent(seed):
     root = rng.normal(size=(4, 4)) * rng.uniform(0.01, 2, 4)
     lengths = np.linalg.norm(rng.normal(size=(100_000, 4)) @ root.T, axis=1)
     assert np.mean(lengths < bound_95(root @ root.T)) == pytest.approx(0.95, abs=0.006)
+    for length in np.quantile(lengths, (0.5, 0.8, 0.99)):
+        assert probability_below(length, root @ root.T) == pytest.approx(np.mean(lengths < length), abs=0.04)
+    assert probability_below(bound_95(root @ root.T), root @ root.T) == pytest.approx(0.95, abs=1e-4)
+    assert probability_below(1.0, np.zeros((3, 3))) == 1

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes import algorithm_1, exact_map
+from scenes import algorithm_1, exact_map, with_shuffled_points
 from slimsfm.errors import InputError
 from slimsfm.features import unit_rows
 from slimsfm.localization.point_descriptors import describe_points
@@ -188,3 +188,9 @@ def test_limits_beyond_any_set_of_images_name_the_nearest(narrow, graph):
     options = ReduceOptions(image_choice=ImageOptions(solver="exact"), limits=ReductionLimits(max_points=1))
     with pytest.raises(InputError, match=r"no set of images meets max_points 1; the nearest, 00\d.png alone"):
         reduce(narrow, options, graph=graph)
+
+
+@pytest.mark.parametrize("choice", [{}, {"image_choice": ImageOptions(images=("001.png",))}])
+def test_what_localizes_nothing_is_not_given_out(choice):
+    with pytest.raises(InputError, match=r"would localize none of (3|4) images left out; nor"):
+        reduce(with_shuffled_points(exact_map(num_images=4)), ReduceOptions(**choice))

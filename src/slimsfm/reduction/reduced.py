@@ -254,16 +254,14 @@ def reduce(
 
 
 def _check_localizes(use: str, one: Candidate) -> None:
-    tests, is_full_useless = len(one.prediction.tests), not one.full.within(ADD_FRACTIONS[0])
+    tests = len(one.prediction.tests)
     if not tests or one.prediction.within(ADD_FRACTIONS[0]):
         return
+    what_to_do = "keep more points or images"
+    if not one.full.within(ADD_FRACTIONS[0]):
+        what_to_do = "nor does the full map, so build or import it again"
     raise InputError(
-        f"the reduced map would localize nothing: of {tests} images left out, its {use} localize none"
-        + (
-            ", nor does the full map; check it, or build it again with more photos"
-            if is_full_useless
-            else "; allow it more points or images"
-        )
+        f"the reduced map for {use} would localize none of {tests} images left out; {what_to_do}"
     )
 
 
