@@ -68,15 +68,15 @@ def test_a_single_photo_to_build(refused, photos, tmp_path):
 def test_a_text_file_named_jpg(refused, boulder, photos, tmp_path):
     bad = photos / "text.jpg"
     bad.write_text("this is not an image")
-    refused("build", photos, "-o", tmp_path / "map", naming=bad)
-    refused("localize", boulder.map_path, photos, "-o", tmp_path / "poses.json", naming=bad)
+    refused("build", photos, "-o", tmp_path / "map", "--strict", naming=bad)
+    refused("localize", boulder.map_path, photos, "-o", tmp_path / "poses.json", "--strict", naming=bad)
     refused("localize", boulder.map_path, bad, "-o", tmp_path / "poses.json", naming=bad)
-    refused("benchmark", "images", photos, "-o", tmp_path / "results", naming=bad)
+    refused("benchmark", "images", photos, "-o", tmp_path / "results", "--build.strict", naming=bad)
 
 
 def test_a_truncated_image(refused, boulder, photos, tmp_path):
     bad = truncated(photos / "12.png")
-    refused("build", photos, "-o", tmp_path / "map", naming=bad)
+    refused("build", photos, "-o", tmp_path / "map", "--strict", naming=bad)
     refused("localize", boulder.map_path, bad, "-o", tmp_path / "poses.json", naming=bad)
 
 

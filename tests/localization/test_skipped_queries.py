@@ -20,7 +20,7 @@ from slimsfm.localization import (
 )
 from slimsfm.localization.pose_files import write_poses
 
-BROKEN = ["0 cut.png", "empty.jpg", "text.png"]
+BROKEN = ["0 cut.jpg", "empty.jpg", "text.png"]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,8 @@ def folder(boulder, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("queries")
     for path in (*boulder.query.image_paths, *boulder.mapping.image_paths[::4]):
         Image.open(path).crop((10, 0, 310, 240)).save(folder / f"{path.parent.parent.name} {path.name}")
-    good = min(folder.iterdir()).read_bytes()
+    Image.open(min(folder.iterdir())).save(folder / BROKEN[0])
+    good = (folder / BROKEN[0]).read_bytes()
     for name, content in zip(BROKEN, (good[: len(good) // 2], b"", b"text"), strict=True):
         (folder / name).write_bytes(content)
     return folder
@@ -78,7 +79,7 @@ def test_pose_files_treat_skipped_queries_as_not_localized(results, tmp_path):
 
 def test_strict_and_no_usable_query_at_all_are_errors(boulder, folder, tmp_path):
     localizer = Localizer(boulder.map)
-    with pytest.raises(ImageError, match=r"0 cut\.png: not a readable image"):
+    with pytest.raises(ImageError, match=r"empty\.jpg: not a readable image"):
         localize_images(localizer, folder, strict=True)
     with pytest.raises(ImageError, match=r"text\.png: not a readable image"):
         localize_images(localizer, folder / "text.png")

@@ -195,7 +195,7 @@ def digest_of(objects: Sequence[ObjectResult]) -> str:
 
 def _comparable(value: Any) -> Any:
     if isinstance(value, dict):
-        ignored = ("seconds", "images", "path", "quality", "notes")
+        ignored = ("seconds", "images", "path", "quality", "notes", "skipped_queries")
         return {key: _comparable(one) for key, one in value.items() if key not in ignored}
     return [_comparable(one) for one in value] if isinstance(value, list) else value
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple, get_args
 
+import numpy as np
 import pycolmap
 
 from slimsfm.arrays import GrayImage, Image
@@ -256,7 +257,7 @@ class _Batch:
 def _differ(one: _Task, other: _Task) -> bool:
     """Whether an image has got another camera."""
     pairs = [(one.cameras[key], other.cameras[key]) for key in one.cameras]
-    return any(a.source != b.source or a.camera.todict() != b.camera.todict() for a, b in pairs)
+    return any(a.source != b.source or not np.array_equal(a.camera.params, b.camera.params) for a, b in pairs)
 
 
 def _with_corrected_cameras(
