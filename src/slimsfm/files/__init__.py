@@ -1,5 +1,19 @@
 """Files: outputs that appear complete or not at all, and readers that trust no input."""
 
 from slimsfm.files.atomic import check_writable, remove, replacing, uninterrupted
+from slimsfm.files.contents import contents_of
+from slimsfm.files.npz import read_npz, unpacked
+from slimsfm.files.text import read_bytes, read_json, read_text
 
-__all__ = ["check_writable", "remove", "replacing", "uninterrupted"]
+__all__ = [
+    "check_writable",
+    "contents_of",
+    "read_bytes",
+    "read_json",
+    "read_npz",
+    "read_text",
+    "remove",
+    "replacing",
+    "uninterrupted",
+    "unpacked",
+]
