@@ -130,7 +130,9 @@ def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[
 
 def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
     if packed.dtype != np.uint8 or packed.shape != ((count + 7) // 8,):
-        raise ValueError(f"an array of shape {packed.shape} does not hold one bit per point for {count} points")
+        raise ValueError(
+            f"an array of shape {packed.shape} does not hold one bit per point for {count} points"
+        )
     return np.unpackbits(packed, count=count).astype(bool)
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Float64, UInt8
 from slimsfm.arrays import Image
 from slimsfm.devices import Device
 from slimsfm.errors import InputError, MapError
-from slimsfm.features.hdf5 import creating, opened, read_array
+from slimsfm.files.hdf5 import creating, opened, read_array
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
 from slimsfm.files import replacing, uninterrupted
 from slimsfm.geometry import Box
@@ -37,7 +37,7 @@ from slimsfm.mapping.descriptors import (
 )
 from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.map import Map, check_map, check_num_features
-from slimsfm.mapping.model import read_model
+from slimsfm.mapping.model import num_keypoints, read_model
 from slimsfm.mapping.quality import quality_from_json
 from slimsfm.photos import Orientation, shrink
 
@@ -125,7 +125,7 @@ def read_map(path: str | Path) -> Map:
         map_ = Map(
             model=model,
             features={} if features is None else features,
-            matches=MatchFile(matches, names) if matches.exists() else {},
+            matches=MatchFile(matches, num_keypoints(model)) if matches.exists() else {},
             point_descriptors=direct,
             global_descriptors=read_global_descriptors(global_descriptors, len(names))
             if global_descriptors.exists()

@@ -103,6 +103,12 @@ def _num_track_elements(model: pycolmap.Reconstruction) -> int:
     return sum(point.track.length() for point in model.points3D.values())
 
 
+def num_keypoints(model: pycolmap.Reconstruction) -> dict[str, int]:
+    """The number of keypoints of each image of a model that has a pose, by name."""
+    images = (model.image(image_id) for image_id in model.reg_image_ids())
+    return {image.name: image.num_points2D() for image in images}
+
+
 def positions(image: pycolmap.Image) -> Points2D:
     """The keypoints of an image of a model."""
     return np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
