@@ -3,7 +3,7 @@
 import os
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
-from math import isfinite
+from math import ceil, isfinite
 from pathlib import Path
 
 from slimsfm.errors import ImageError, InputError
@@ -21,10 +21,11 @@ _GB, _MEGAPIXEL = 1e9, 1e6
 class Limits:
     """The largest images and files that are read."""
 
-    max_megapixels: float = 120.0
-    """Pixels of an image or of a frame of a video, in millions. Reading as many takes a gigabyte of memory."""
+    max_megapixels: float | int = 120.0
+    """Pixels of an image or of a frame of a video, in millions. Reading as many takes a gigabyte of memory,
+    two if they have 16 bits."""
 
-    max_file_gb: float = 2.0
+    max_file_gb: float | int = 2.0
     """Unpacked size of a file that is read as a whole, or of an array in one, in gigabytes."""
 
     def __post_init__(self) -> None:
@@ -33,7 +34,7 @@ class Limits:
                 raise ValueError(f"{name} must be positive, got {value}")
 
     @classmethod
-    def from_environment(cls, max_megapixels: float | None = None) -> "Limits":
+    def from_environment(cls, max_megapixels: float | int | None = None) -> "Limits":
         """The user's defaults, from the environment variables, for what is not given.
 
         Raises:
@@ -104,8 +105,8 @@ def check_pixels(source: Path | str, width: int, height: int) -> None:
     has, most = width * height / _MEGAPIXEL, current_limits().max_megapixels
     if has > most:
         raise ImageError(
-            f"{source}: has {has:.0f} megapixels, more than the limit of {most:g}; shrink it or raise the limit "
-            f"by `max_megapixels={has:.0f}` (environment variable {MEGAPIXELS})"
+            f"{source}: has {has:.4g} megapixels, more than the limit of {most:g}; shrink it or pass "
+            f"`max_megapixels={ceil(has)}` (environment variable {MEGAPIXELS})"
         )
 
 
@@ -122,6 +123,6 @@ def check_bytes(source: Path | str, num_bytes: int) -> None:
     most = current_limits().max_file_gb
     if num_bytes > most * _GB:
         raise InputError(
-            f"{source}: takes {num_bytes / _GB:.3g} GB of memory, more than the limit of {most:g} GB; if it is "
-            f"right, raise the limit by the environment variable {FILE_GB}"
+            f"{source}: takes {num_bytes / _GB:.3g} GB of memory, more than the limit of {most:g} GB; if "
+            f"that is right, set the environment variable {FILE_GB}"
         )

@@ -1,6 +1,9 @@
 """`slimsfm import`."""
 
-from slimsfm.cli.options import ModelPath, OutputPath
+from typing import Annotated
+
+from slimsfm.cli.arguments import Reading
+from slimsfm.cli.options import Advanced, ModelPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import write_map
@@ -12,6 +15,7 @@ def import_(
     /,
     output: OutputPath,
     source: ImportOptions = ImportOptions(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     overwrite: bool = False,
 ) -> None:
     """Make a map from a COLMAP model and the descriptors of its keypoints.
@@ -20,9 +24,11 @@ def import_(
         model: Folder with cameras, images and points3D, as .bin or .txt.
         output: Folder of the map.
         source: Where the descriptors come from.
+        reading: Limits on what is read.
         overwrite: Replace an existing map.
     """
     watch = Stopwatch()
+    reading.apply()
     check_output(output, model, *source.paths(model), overwrite=overwrite)
     made = import_colmap(model, options=source, progress=shown)
     write_map(made, output, overwrite=overwrite)

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks
+from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError
@@ -34,6 +34,7 @@ def localize(
     full: Path | None = None,
     localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     camera: Path | None = None,
     gravity: Path | None = None,
     workers: int | None = None,
@@ -49,6 +50,7 @@ def localize(
         full: The full map that the map was reduced from, for images that the reduced one gives no pose.
         localization: How to localize.
         networks: Where learned methods run.
+        reading: Limits on what is read.
         camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map where
             size and EXIF fit, else from EXIF; else the focal length is estimated.
         gravity: Direction of gravity as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame
@@ -58,6 +60,7 @@ def localize(
     """
     watch = Stopwatch()
     networks.apply()
+    reading.apply()
     check_output(output, map, images, *also, full, camera, gravity, overwrite=overwrite)
     writer_for(output, several=bool(also))
     _check_options(workers, also, gravity=gravity, full=full)

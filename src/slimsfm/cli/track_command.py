@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks
+from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.localization import LocalizationOptions, Localizer
@@ -29,6 +29,7 @@ def track(
     tracker: Annotated[TrackerOptions, Advanced()] = TrackerOptions(),
     localization: Annotated[LocalizationOptions, Advanced()] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     overwrite: bool = False,
 ) -> None:
     """Track an object through a video and write the camera pose of every frame.
@@ -43,10 +44,12 @@ def track(
         tracker: How to track.
         localization: How to localize.
         networks: Where learned methods run.
+        reading: Limits on what is read.
         overwrite: Replace existing outputs.
     """
     watch = Stopwatch()
     networks.apply()
+    reading.apply()
     for path in (output, video) if video else (output,):
         check_output(path, map, Path(source), camera, overwrite=overwrite)
     writer_for(output)

@@ -1,7 +1,7 @@
-"""HDF5 files: read within what they can hold, or created in a way that survives a full disk and interruptions.
+"""HDF5 files: read within what they can hold, or created so that they survive a full disk and interruptions.
 
-Nothing outside a file is read: links, virtual datasets and external storage are refused. An array is allocated
-only if the file can hold it: HDF5 itself believes a damaged header that claims terabytes.
+Nothing outside a file is read: links, virtual datasets and external storage are refused. An array is
+allocated only if the file can hold it, because HDF5 believes a damaged header that claims terabytes.
 """
 
 import zlib
@@ -28,8 +28,8 @@ _MAX_RATIO = 1100  # of unpacked to packed bytes; deflate reaches 1032
 _SMALL_CHUNK = 250_000  # packed bytes that unpack to little, whatever they claim
 
 
-def groups_with(file: h5py.File, dataset: str) -> list[str]:
-    """Names of all groups that hold a dataset of this name.
+def datasets_of(file: h5py.File) -> list[str]:
+    """Names of all datasets, and of groups without any.
 
     Raises:
         ValueError: The file holds links to other names or files.
@@ -43,11 +43,17 @@ def groups_with(file: h5py.File, dataset: str) -> list[str]:
 
     file.id.links.visit(visit, info=True)
     groups = {name.rpartition("/")[0] for name in names}
-    return [
-        name.removesuffix(f"/{dataset}")
-        for name in names
-        if name.endswith(f"/{dataset}") and name not in groups
-    ]
+    return [name for name in names if name not in groups]
+
+
+def groups_with(file: h5py.File, dataset: str) -> list[str]:
+    """Names of all groups that hold a dataset of this name.
+
+    Raises:
+        ValueError: As in `datasets_of`.
+    """
+    end = f"/{dataset}"
+    return [name.removesuffix(end) for name in datasets_of(file) if name.endswith(end)]
 
 
 def shape_and_type(file: h5py.File, name: str) -> tuple[tuple[int, ...], np.dtype]:

@@ -18,16 +18,15 @@ from pathlib import Path
 from typing import get_args
 
 import cv2
-import h5py
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from slimsfm.arrays import Image
 from slimsfm.devices import Device
 from slimsfm.errors import InputError, MapError
-from slimsfm.files.hdf5 import creating, opened, read_array
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
-from slimsfm.files import replacing, uninterrupted
+from slimsfm.files import contents_of, replacing, uninterrupted
+from slimsfm.files.hdf5 import creating, datasets_of, opened, read_array
 from slimsfm.geometry import Box
 from slimsfm.mapping.descriptors import (
     read_global_descriptors,
@@ -39,9 +38,10 @@ from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.map import Map, check_map, check_num_features
 from slimsfm.mapping.model import num_keypoints, read_model
 from slimsfm.mapping.quality import quality_from_json
-from slimsfm.photos import Orientation, shrink
+from slimsfm.photos import Orientation, decode_jpeg, shrink
 
 _QUALITY = 95
+_AGAIN = "build the map again"
 
 
 class PhotoFile(Mapping[str, Image]):
@@ -53,22 +53,15 @@ class PhotoFile(Mapping[str, Image]):
 
     def __init__(self, path: Path) -> None:
         self._file, self._path = opened(path), path
-        found: list[str] = []
-        self._file.visititems(
-            lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None
-        )
-        self._names = dict.fromkeys(sorted(found))
+        with contents_of(path, _AGAIN):
+            self._names = dict.fromkeys(sorted(datasets_of(self._file)))
 
     def __getitem__(self, name: str) -> Image:
         if name not in self._names:
             raise KeyError(name)
-        try:
-            photo = cv2.imdecode(np.asarray(read_array(self._file, name), np.uint8), cv2.IMREAD_COLOR_RGB)
-        except (cv2.error, OSError, TypeError, ValueError) as error:
-            raise InputError(f"{self._path}: the photo of {name!r} is damaged ({error})") from error
-        if photo is None:
-            raise InputError(f"{self._path}: the photo of {name!r} is damaged")
-        return np.asarray(photo, np.uint8)
+        source = f"{self._path}: the photo of {name!r}"
+        with contents_of(source, _AGAIN):
+            return decode_jpeg(read_array(self._file, name), source)
 
     def __contains__(self, name: object) -> bool:
         return name in self._names
