@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from slimsfm.arrays import Points3D
 from slimsfm.datasets.base import ObjectModel, PosedSequence
 from slimsfm.features import Features, load_extractor
+from slimsfm.files import inside
 from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_error
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
@@ -234,12 +235,12 @@ class Run:
 
 def map_path(folder: Path, name: str, method: str, variant: str) -> Path:
     """Folder of one map of an object, inside the folder of a run."""
-    return maps_path(folder, name) / method / variant.replace(":", "-")
+    return inside(maps_path(folder, name) / method, variant.replace(":", "-"))
 
 
 def maps_path(folder: Path, name: str) -> Path:
     """Folder of all maps of an object, inside the folder of a run."""
-    return folder / "maps" / name
+    return inside(folder / "maps", name)
 
 
 @dataclass(frozen=True, kw_only=True)
