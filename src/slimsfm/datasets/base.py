@@ -12,6 +12,7 @@ from scipy.spatial.distance import pdist
 
 from slimsfm.arrays import Points3D
 from slimsfm.errors import InputError
+from slimsfm.files import inside
 from slimsfm.geometry import Box
 from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
 from slimsfm.mapping.map import Map
@@ -163,7 +164,7 @@ class PosedSequence:
     @property
     def image_paths(self) -> tuple[Path, ...]:
         """Paths of the image files."""
-        return tuple(self.folder / name for name in self.names)
+        return tuple(inside(self.folder, name) for name in self.names)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -170,7 +170,7 @@ def _options_from_json(options: Any) -> dict:
     """Any plain values, but those that the reference graph depends on are of their types."""
     if not isinstance(options, dict):
         raise ValueError("the options are no table")
-    json.dumps(options, allow_nan=False).encode()
+    json.dumps(options, allow_nan=False, ensure_ascii=False).encode()
     plain(options.get("command", ""), str)
     plain(options.get("edges", "localize"), Edges)
     threshold = plain(options.get("reduction", {}).get("threshold", 1.0), float)

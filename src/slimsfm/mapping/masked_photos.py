@@ -14,6 +14,7 @@ from typing import Literal
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, InputError
+from slimsfm.files import inside
 from slimsfm.image_files import FoundImages, find_images, named
 from slimsfm.photos import Orientation, Photo, as_stored, read_photo, read_stored_mask, upright
 
@@ -78,7 +79,7 @@ class MaskedPhotos:
         Raises:
             ImageError: The photo or its mask is unreadable, or they differ in size.
         """
-        photo = read_photo(self._folder / name, self._orientation, warn=False)
+        photo = read_photo(inside(self._folder, name), self._orientation, warn=False)
         if photo.num_frames > 1:
             self._said["photo(s) of several frames or pages, of which the first is used"].add(name)
         mask = self._mask(name, photo)
@@ -116,7 +117,9 @@ class MaskedPhotos:
                 f"{masks}: is the folder of the photos; put the masks into a folder of their own"
             )
         for name in self._names:
-            candidates = (masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png"))
+            candidates = [
+                inside(masks, one) for one in (f"{name}.png", str(PurePosixPath(name).with_suffix(".png")))
+            ]
             path = next((path for path in candidates if path.is_file()), None)
             if path is None:
                 self._said["photo(s) without a mask, used whole"].add(name)

@@ -17,6 +17,7 @@ from slimsfm.errors import ImageError, ModelError
 from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.sift import Sift, root_sift
+from slimsfm.files import inside
 from slimsfm.mapping.agreement import counted
 from slimsfm.mapping.model import camera_of, positions
 from slimsfm.photos import Orientation, read_image
@@ -47,7 +48,7 @@ def redescribe(
     """
     extractor, features, scales = Sift(), {}, (0.0, np.inf)
     for image in progress(images, "describe keypoints"):
-        path = folder / image.name
+        path = inside(folder, image.name)
         pixels, camera = read_image(path, orientation), camera_of(image)
         _check_turn(pixels, camera, path, orientation)
         scales = _common_scales(scales, pixels, camera, path)
