@@ -139,7 +139,7 @@ def test_damaged_features_are_named(stored, damage):
         read["z.jpg"]
 
 
-@pytest.mark.parametrize("open_file", [FeatureFile, lambda path: MatchFile(path, dict.fromkeys(NAMES, 7))])
+@pytest.mark.parametrize("open_file", [FeatureFile, lambda path: MatchFile(path, NAMES)])
 def test_a_file_cut_short_is_an_input_error(stored, open_file):
     path, _ = stored
     whole = path.read_bytes()
@@ -161,7 +161,7 @@ def test_matches_come_back_as_they_were(tmp_path):
         rows = np.sort(rng.permutation(counts[a])[:size])
         matches[a, b] = np.stack([rows, rng.permutation(counts[b])[:size]], axis=1).astype(np.int64)
     write_matches(tmp_path / "matches.h5", matches, counts)
-    read = MatchFile(tmp_path / "matches.h5", counts)
+    read = MatchFile(tmp_path / "matches.h5", NAMES, counts)
     assert list(read) == sorted(matches)
     assert len(read) == 4
     for pair, expected in matches.items():
@@ -170,15 +170,13 @@ def test_matches_come_back_as_they_were(tmp_path):
         read[NAMES[0], NAMES[2]]
     with h5py.File(tmp_path / "matches.h5") as file:  # as hloc names pairs
         assert file["cam-1-x.png/cam-1-ä y.png/matches0"].shape == (12,)
-    assert list(MatchFile(tmp_path / "matches.h5", {name: counts[name] for name in NAMES[:2]})) == [
-        (NAMES[0], NAMES[1])
-    ]
+    assert list(MatchFile(tmp_path / "matches.h5", NAMES[:2])) == [(NAMES[0], NAMES[1])]
 
 
 def test_damaged_matches_are_named(tmp_path):
     with h5py.File(tmp_path / "matches.h5", "w") as file:
         file.create_group("a.png/b.png").create_group("matches0")
-    read = MatchFile(tmp_path / "matches.h5", {"a.png": 7, "b.png": 7})
+    read = MatchFile(tmp_path / "matches.h5", ["a.png", "b.png"])
     with pytest.raises(InputError, match=r"matches of \('a\.png', 'b\.png'\): damaged"):
         read["a.png", "b.png"]
 
@@ -199,7 +197,9 @@ def test_names_that_hdf5_spells_otherwise_come_back(tmp_path):
     counts = dict.fromkeys(SPELLINGS, 7)
     matches = {(SPELLINGS[0], SPELLINGS[1]): np.array([[1, 2], [3, 0]])}
     write_matches(tmp_path / "matches.h5", matches, counts)
-    assert np.array_equal(MatchFile(tmp_path / "matches.h5", counts)[next(iter(matches))], [[1, 2], [3, 0]])
+    assert np.array_equal(
+        MatchFile(tmp_path / "matches.h5", SPELLINGS)[next(iter(matches))], [[1, 2], [3, 0]]
+    )
 
 
 def test_matches_tell_names_apart_that_hloc_does_not(tmp_path):
@@ -209,7 +209,7 @@ def test_matches_tell_names_apart_that_hloc_does_not(tmp_path):
     pairs = [(a, b) for a in names for b in names if a < b]
     matches = {pair: np.array([[i, i]]) for i, pair in enumerate(pairs)}
     write_matches(tmp_path / "matches.h5", matches, dict.fromkeys(names, len(pairs)))
-    read = MatchFile(tmp_path / "matches.h5", dict.fromkeys(names[::-1], len(pairs)))
+    read = MatchFile(tmp_path / "matches.h5", names[::-1])
     assert {pair: read[pair].tolist() for pair in read} == {pair: [[i, i]] for i, pair in enumerate(pairs)}
 
 
@@ -221,7 +221,7 @@ def test_old_names_of_pairs_are_read(tmp_path):
             targets = np.full(9, -1)
             targets[i % 9] = 3
             file[f"{a.replace('/', '-')}_{b.replace('/', '-')}/matches0"] = targets
-    read = MatchFile(tmp_path / "matches.h5", dict.fromkeys(names, 9))
+    read = MatchFile(tmp_path / "matches.h5", names)
     assert {pair: read[pair].tolist() for pair in read} == {pair: [[i, 3]] for i, pair in enumerate(pairs)}
     assert read.num_other_pairs == 1
 
@@ -229,5 +229,5 @@ def test_old_names_of_pairs_are_read(tmp_path):
 def test_a_pair_that_can_be_read_in_two_ways_is_no_pair(tmp_path):
     with h5py.File(tmp_path / "matches.h5", "w") as file:
         file["a_b_c/matches0"] = np.array([0])
-    assert list(MatchFile(tmp_path / "matches.h5", {"a": 1, "b_c": 1})) == [("a", "b_c")]
-    assert list(MatchFile(tmp_path / "matches.h5", dict.fromkeys(("a", "b_c", "a_b", "c"), 1))) == []
+    assert list(MatchFile(tmp_path / "matches.h5", ["a", "b_c"])) == [("a", "b_c")]
+    assert list(MatchFile(tmp_path / "matches.h5", ["a", "b_c", "a_b", "c"])) == []

@@ -96,6 +96,8 @@ def stored_name(name: str) -> str:
 
 def _read_features(file: h5py.File, name: str) -> Features:
     keypoints = _read_floats(file, f"{name}/keypoints")
+    if f"{name}/descriptors" not in file:
+        raise ValueError("keypoints without descriptors")
     descriptors = _finite(read_array(file, f"{name}/descriptors"), "descriptors").T
     scores = _read_floats(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
@@ -141,17 +143,20 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
 
     Args:
         path: The file.
-        num_keypoints: Number of keypoints of each image whose matches are read.
+        names: The images whose matches are read.
+        num_keypoints: Their numbers of keypoints; None if the caller checks that no match is beyond them.
 
     Raises:
         InputError: The file is missing or damaged, at construction; an entry is damaged or matches keypoints
             that its images do not have, at access.
     """
 
-    def __init__(self, path: Path, num_keypoints: Mapping[str, int]) -> None:
+    def __init__(
+        self, path: Path, names: Iterable[str], num_keypoints: Mapping[str, int] | None = None
+    ) -> None:
         self._file = opened(path)
         self._path, self._num_keypoints = path, num_keypoints
-        by_key = {key: name for name, key in _keys(num_keypoints).items()}
+        by_key = {key: name for name, key in _keys(names).items()}
         with contents_of(path, _AGAIN):
             groups = groups_with(self._file, "matches0")
         pairs = ((_pair_of(group, by_key), group) for group in groups)
@@ -164,11 +169,12 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
             raise KeyError(pair)
         with contents_of(f"{self._path}: the matches of {pair}", _AGAIN):
             targets = read_array(self._file, f"{self._groups[pair]}/matches0")
-            most, beyond = (self._num_keypoints[name] for name in pair)
-            if targets.ndim != 1 or targets.dtype.kind != "i" or len(targets) > most:
+            if targets.ndim != 1 or targets.dtype.kind != "i":
                 raise ValueError(f"matches0 of shape {targets.shape} and type {targets.dtype}")
-            if targets.max(initial=-1) >= beyond:
-                raise ValueError(f"matches keypoint {targets.max()} of {beyond}")
+            if self._num_keypoints:
+                a, b = (self._num_keypoints[name] for name in pair)
+                if len(targets) > a or targets.max(initial=-1) >= b:
+                    raise ValueError(f"matches beyond the {a} and {b} keypoints of its images")
         rows = np.flatnonzero(targets >= 0)
         return np.stack([rows, targets[rows]], axis=1, dtype=np.int64)
 

@@ -118,7 +118,7 @@ def read_map(path: str | Path) -> Map:
         map_ = Map(
             model=model,
             features={} if features is None else features,
-            matches=MatchFile(matches, num_keypoints(model)) if matches.exists() else {},
+            matches=MatchFile(matches, names, num_keypoints(model)) if matches.exists() else {},
             point_descriptors=direct,
             global_descriptors=read_global_descriptors(global_descriptors, len(names))
             if global_descriptors.exists()

@@ -117,9 +117,7 @@ class MaskedPhotos:
                 f"{masks}: is the folder of the photos; put the masks into a folder of their own"
             )
         for name in self._names:
-            candidates = [
-                inside(masks, one) for one in (f"{name}.png", str(PurePosixPath(name).with_suffix(".png")))
-            ]
+            candidates = (masks / f"{name}.png", masks / PurePosixPath(name).with_suffix(".png"))
             path = next((path for path in candidates if path.is_file()), None)
             if path is None:
                 self._said["photo(s) without a mask, used whole"].add(name)

@@ -118,7 +118,7 @@ def from_hloc(images: list[pycolmap.Image], path: Path, matches: Path | None, ex
                 f"{matches}: cannot tell {counted(indistinct)} from names that have - instead of /; "
                 "leave `matches` out"
             )
-        found = MatchFile(matches, {name: len(one) for name, one in features.items()})
+        found = MatchFile(matches, sorted(features))
         notes = _check_pairs(matches, found)
     return Source(
         path=path,

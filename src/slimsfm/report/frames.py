@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
+from slimsfm.errors import InputError
 from slimsfm.files import inside
 from slimsfm.geometry import BOX_EDGES, Box, project
 from slimsfm.photos import read_image, shrink
@@ -152,7 +153,7 @@ def jpeg_uri(image: Image, *, thin_lines: bool) -> str:
 
 
 def photo_uri(folder: Path, name: str, max_size: int) -> str | None:
-    """A photo of a folder as a data URI, its longer side at most `max_size` pixels; None if it cannot be read."""
+    """A photo as a data URI, its longer side at most `max_size` pixels; None if it cannot be read."""
     try:
         return jpeg_uri(shrink(read_image(inside(folder, name)), max_size), thin_lines=False)
     except InputError:
