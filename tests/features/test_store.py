@@ -204,7 +204,7 @@ def test_names_that_hdf5_spells_otherwise_come_back(tmp_path):
 
 def test_matches_tell_names_apart_that_hloc_does_not(tmp_path):
     names = ["a-b.png", "a/b.png", "a-b/c.png", "a/b/c.png", "a/b-c.png"]
-    assert indistinct_names(names) == ["a/b-c.png", "a/b.png", "a/b/c.png"]
+    assert indistinct_names(names) == sorted(names)
     assert indistinct_names(NAMES) == []
     pairs = [(a, b) for a in names for b in names if a < b]
     matches = {pair: np.array([[i, i]]) for i, pair in enumerate(pairs)}

@@ -116,7 +116,7 @@ def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collectio
     images = list(next(iter(by_object.values())))
     every = (one for results in by_object.values() for one in results.values())
     for note in dict.fromkeys(note for one in every for note in one.camera_notes):
-        console.print(f"note: {note}", style="yellow", markup=False)
+        console.print(f"note: {note}", style="yellow")
     for image in images:
         for key, results in by_object.items():
             name = f"{image}, {key}" if len(by_object) > 1 else image

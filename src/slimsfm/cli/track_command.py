@@ -66,7 +66,7 @@ def track(
     write_poses(output, poses, seconds=seconds, overwrite=overwrite)
     _sum_up(output, list(frames.values()))
     if tracked.ended_early:
-        console.print(f"warning: {tracked.ended_early}", style="bold red", markup=False)
+        console.print(f"warning: {tracked.ended_early}", style="bold red")
     finish(f"{video or output}: {plural(len(frames), 'frame')}", watch)
 
 

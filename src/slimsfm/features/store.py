@@ -13,6 +13,7 @@ hloc puts the center of the top-left pixel at (0, 0), everything else in slimsfm
 module converts.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
@@ -255,8 +256,10 @@ def _keys(names: Iterable[str]) -> dict[str, str]:
 
 
 def indistinct_names(names: Iterable[str]) -> list[str]:
-    """Names of images that hloc's matches do not tell apart from another name."""
-    return [name for name, key in _keys(names).items() if key != name.replace("/", "-")]
+    """Names of images that hloc's matches do not tell apart from another one of these names, sorted."""
+    names = sorted(names)
+    counts = Counter(name.replace("/", "-") for name in names)
+    return [name for name in names if counts[name.replace("/", "-")] > 1]
 
 
 def _pair_of(group: str, by_key: Mapping[str, str]) -> tuple[str, str] | None:
