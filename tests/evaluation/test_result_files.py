@@ -253,13 +253,13 @@ DAMAGE = {
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
 def test_damaged_results_are_named_in_the_error(written, damage):
     written.write_text(damage(written.read_text()))
-    with pytest.raises(InputError, match=r"results\.json: damaged or of another kind \(.*; run"):
+    with pytest.raises(InputError, match=r"results\.json: not a result of slimsfm benchmark \(.*; run"):
         read_run(written.parent)
 
 
 def test_binary_results_are_named_in_the_error(written):
     written.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match=r"results\.json: damaged"):
+    with pytest.raises(InputError, match=r"results\.json: not a result"):
         read_run(written)
 
 

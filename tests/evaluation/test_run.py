@@ -274,7 +274,7 @@ def test_a_damaged_result_of_an_object_is_named_in_the_error(whole, dataset, tmp
     shutil.copytree(whole.folder, tmp_path / "run")
     path = object_path(tmp_path / "run", "mug")
     path.write_text(path.read_text()[:1000])
-    with pytest.raises(InputError, match=r"mug\.json: damaged .*delete it"):
+    with pytest.raises(InputError, match=r"mug\.json: not a result of slimsfm benchmark .*delete it"):
         run_benchmark(dataset, bench_in(tmp_path / "run"))
 
 

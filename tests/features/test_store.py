@@ -135,7 +135,7 @@ def test_damaged_features_are_named(stored, damage):
         damage(file)
     read = FeatureFile(stored[0])
     assert len(read["a b.png"]) == 7
-    with pytest.raises(InputError, match=r"features of 'z\.jpg': damaged"):
+    with pytest.raises(InputError, match=r"features of 'z\.jpg' are damaged"):
         read["z.jpg"]
 
 
@@ -177,7 +177,7 @@ def test_damaged_matches_are_named(tmp_path):
     with h5py.File(tmp_path / "matches.h5", "w") as file:
         file.create_group("a.png/b.png").create_group("matches0")
     read = MatchFile(tmp_path / "matches.h5", ["a.png", "b.png"])
-    with pytest.raises(InputError, match=r"matches of \('a\.png', 'b\.png'\): damaged"):
+    with pytest.raises(InputError, match=r"matches of \('a\.png', 'b\.png'\) are damaged"):
         read["a.png", "b.png"]
 
 

@@ -217,13 +217,13 @@ def test_errors_of_another_system_are_read_from_a_table(exact, tmp_path):
         ("reference,image,error\n001.png,002.png,0.1\n", "lacks one of the columns reference, query, error"),
         (CSV + "001.png,nobody.png,0.1\n", "'nobody.png' is not an image of the map"),
         (CSV + "001.png\n", "None is not an image of the map"),
-        (CSV + "001.png,002.png\n", "damaged or of another kind"),
+        (CSV + "001.png,002.png\n", "not a readable table"),
         (CSV + "001.png,002.png,small\n", "could not convert string to float: 'small'"),
         (CSV + "001.png,002.png,nan\n", "errors must be numbers from 0 to infinity"),
         (CSV + "001.png,002.png,-0.1\n", "errors must be numbers from 0 to infinity"),
         (CSV + "001.png,002.png,0.1\n001.png,002.png,0.1\n", "pairs must not repeat"),
         (CSV + "001.png,001.png,0.1\n", "pairs must join two different images"),
-        (CSV + "001.png,\x00,0.1\n", "damaged or of another kind|is not an image of the map"),
+        (CSV + "001.png,\x00,0.1\n", "not a readable table|is not an image of the map"),
     ],
 )
 def test_a_bad_table_is_named(exact, tmp_path, text, message):

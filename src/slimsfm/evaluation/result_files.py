@@ -30,7 +30,7 @@ from slimsfm.graph.edge_sources import Edges
 
 RESULT_FORMAT_VERSION = 1
 
-_AGAIN = "run the benchmark again"
+_NO_RESULT, _AGAIN = "not a result of slimsfm benchmark", "run the benchmark again"
 
 
 def write_json(path: Path, data: dict) -> None:
@@ -131,7 +131,7 @@ def read_object_result(path: Path) -> ObjectResult:
     Raises:
         InputError: The file is damaged.
     """
-    with contents_of(path, f"delete it and {_AGAIN}"):
+    with contents_of(path, _NO_RESULT, f"delete it and {_AGAIN}"):
         return object_from_json(read_json(path))
 
 
@@ -147,7 +147,7 @@ def read_run(folder: Path) -> Run:
     path = folder if folder.suffix == ".json" else folder / "results.json"
     if not path.is_file():
         raise InputError(f"{path}: no such file; pass the folder of a run of slimsfm benchmark")
-    with contents_of(path, _AGAIN):
+    with contents_of(path, _NO_RESULT, _AGAIN):
         data = read_json(path)
         if data["format"] != RESULT_FORMAT_VERSION:
             raise InputError(

@@ -147,7 +147,7 @@ def _is_empty(folder: Path) -> bool:
 
 def _read_description(path: Path) -> dict | None:
     try:
-        with contents_of(path, "choose another folder"):
+        with contents_of(path, "is no run"):
             found = read_json(path)
     except InputError:
         return None

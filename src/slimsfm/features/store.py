@@ -47,7 +47,7 @@ class FeatureFile(Mapping[str, Features]):
         self._file = opened(path)
         self._path = path
         spelled = {stored_name(name): name for name in names}
-        with contents_of(path, _AGAIN):
+        with contents_of(path, "damaged", _AGAIN):
             stored = groups_with(self._file, "keypoints")
         self._names = dict.fromkeys(sorted(spelled.get(name, name) for name in stored))
         self._kind: tuple[int, np.dtype] | None = None  # of the descriptors of the first image that has some
@@ -68,7 +68,7 @@ class FeatureFile(Mapping[str, Features]):
             return shape_and_type(self._file, f"{name}/keypoints")[0][0]
 
     def _contents_of(self, name: str) -> AbstractContextManager[None]:
-        return contents_of(f"{self._path}: the features of {name!r}", _AGAIN)
+        return contents_of(self._path, f"the features of {name!r} are damaged", _AGAIN)
 
     def _check_kind(self, count: int, length: int, kind: np.dtype) -> None:
         if not count:
@@ -158,7 +158,7 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
         self._file = opened(path)
         self._path, self._num_keypoints = path, num_keypoints
         by_key = {key: name for name, key in _keys(names).items()}
-        with contents_of(path, _AGAIN):
+        with contents_of(path, "damaged", _AGAIN):
             groups = groups_with(self._file, "matches0")
         pairs = ((_pair_of(group, by_key), group) for group in groups)
         found = {pair: group for pair, group in pairs if pair is not None}
@@ -168,7 +168,7 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
     def __getitem__(self, pair: tuple[str, str]) -> IndexPairs:
         if pair not in self._groups:
             raise KeyError(pair)
-        with contents_of(f"{self._path}: the matches of {pair}", _AGAIN):
+        with contents_of(self._path, f"the matches of {pair} are damaged", _AGAIN):
             targets = read_array(self._file, f"{self._groups[pair]}/matches0")
             if targets.ndim != 1 or targets.dtype.kind != "i":
                 raise ValueError(f"matches0 of shape {targets.shape} and type {targets.dtype}")

@@ -8,15 +8,15 @@ from slimsfm.errors import InputError, SlimsfmError
 
 
 @contextmanager
-def contents_of(path: Path | str, advice: str, kind: type[InputError] = InputError) -> Iterator[None]:
+def contents_of(path: Path, what: str, advice: str = "") -> Iterator[None]:
     """Report whatever parsing the contents of a file raises as an error that names the file.
 
     The block only parses: libraries raise all kinds of errors for damaged contents.
 
     Args:
-        path: The file, or what of it is parsed.
-        advice: What to do, or what the file should hold.
-        kind: Class of the error.
+        path: The file.
+        what: What is wrong, such as "damaged" or "must hold 8 corners"; the reason is appended.
+        advice: What to do.
 
     Raises:
         InputError: The block raised an error; one that a user can fix already is raised as it is.
@@ -25,14 +25,14 @@ def contents_of(path: Path | str, advice: str, kind: type[InputError] = InputErr
         yield
     except SlimsfmError:
         raise
-    except FileNotFoundError as error:
-        raise kind(f"{path}: no such file") from error
     except Exception as error:
-        raise kind(f"{path}: damaged or of another kind ({_reason(error)}); {advice}") from error
+        raise InputError(f"{path}: {what} ({_reason(error)}){'; ' * bool(advice)}{advice}") from error
 
 
 def _reason(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"without {error}"
+    if isinstance(error, FileNotFoundError):
+        return "there is no such file"
     text = " ".join(str(error).split())
     return text or type(error).__name__

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from slimsfm.limits import check_bytes
 
@@ -29,14 +29,10 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Numbers that JSON does not know, such as NaN, are refused.
+    """Read a JSON file. Its numbers may be infinite or NaN; `plain` refuses those.
 
     Raises:
         InputError, OSError, UnicodeDecodeError: As in `read_text`.
         ValueError, RecursionError: The file is not JSON.
     """
-    return json.loads(read_text(path), parse_constant=_refuse)
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number")
+    return json.loads(read_text(path))

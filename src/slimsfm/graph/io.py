@@ -115,7 +115,7 @@ def read_kept_graph(path: Path, key: str, start: float) -> GraphRun | None:
         start: When the caller started, by `perf_counter`: the time until now is reported as that of reading.
     """
     try:
-        with contents_of(path, "compute the graph again"):
+        with contents_of(path, "damaged"):
             stored = read_npz(path)
             if str(stored["key"]) != key:
                 return None
@@ -153,7 +153,7 @@ def read_given_graph(path: str | Path, map: Map) -> ReferenceGraph:
     path = Path(path)
     if path.suffix == ".csv":
         return _read_csv(path, map)
-    with contents_of(path, "give a graph as .csv, or as .npz of slimsfm"):
+    with contents_of(path, "not a readable graph, neither .csv nor .npz"):
         graph = _from_npz(read_npz(path))
     if graph.names != tuple(map.images):
         raise InputError(f"{path}: the images of the graph are not those of the map")
@@ -163,7 +163,7 @@ def read_given_graph(path: str | Path, map: Map) -> ReferenceGraph:
 def _read_csv(path: Path, map: Map) -> ReferenceGraph:
     index = {name: number for number, name in enumerate(map.images)}
     pairs, errors = [], []
-    with contents_of(path, "give a table with the columns reference, query, error"):
+    with contents_of(path, "not a readable table of errors"):
         rows = csv.DictReader(StringIO(read_text(path), newline=""))
         if not {"reference", "query", "error"} <= set(rows.fieldnames or ()):
             raise InputError(f"{path}: lacks one of the columns reference, query, error")

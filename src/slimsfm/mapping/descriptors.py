@@ -106,7 +106,7 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
     Raises:
         InputError: The file is damaged, or belongs to another model.
     """
-    with contents_of(path, "reduce the full map again"):
+    with contents_of(path, "damaged", "reduce the full map again"):
         arrays = read_npz(path)
         most = num_points * np.uint32().nbytes
         steps = np.frombuffer(unpacked(arrays["points"].tobytes(), most), np.uint32)
@@ -181,7 +181,7 @@ def read_global_descriptors(path: Path, num_images: int) -> GlobalDescriptors:
     Raises:
         InputError: The file is damaged, or belongs to another map.
     """
-    with contents_of(path, "build or import the map again"):
+    with contents_of(path, "damaged", "build or import the map again"):
         arrays = read_npz(path)
         words, rows = arrays["words"].astype(np.float32), unpack(arrays, num_images)
         if words.ndim != 2 or not words.size or rows.shape[1] != words.size or not np.isfinite(words).all():

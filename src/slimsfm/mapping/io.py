@@ -53,15 +53,15 @@ class PhotoFile(Mapping[str, Image]):
 
     def __init__(self, path: Path) -> None:
         self._file, self._path = opened(path), path
-        with contents_of(path, _AGAIN):
+        with contents_of(path, "damaged", _AGAIN):
             self._names = dict.fromkeys(sorted(datasets_of(self._file)))
 
     def __getitem__(self, name: str) -> Image:
         if name not in self._names:
             raise KeyError(name)
-        source = f"{self._path}: the photo of {name!r}"
-        with contents_of(source, _AGAIN):
-            return decode_jpeg(read_array(self._file, name), source)
+        what = f"the photo of {name!r}"
+        with contents_of(self._path, f"{what} is damaged", _AGAIN):
+            return decode_jpeg(read_array(self._file, name), f"{self._path}: {what}")
 
     def __contains__(self, name: object) -> bool:
         return name in self._names

@@ -4,7 +4,6 @@ Damage that pycolmap does not notice is searched for in its bytes (`mapping.bina
 returns.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.arrays import Ids, Points2D, Points3D
-from slimsfm.errors import InputError, ModelError
+from slimsfm.errors import ModelError
+from slimsfm.files import contents_of, read_json, read_text
 from slimsfm.geometry import Box
 from slimsfm.mapping.binary import MODEL_PARTS, check_binary
 from slimsfm.mapping.text import read_text_model
@@ -142,20 +142,14 @@ def read_box(path: str | Path) -> Box:
         InputError: The file is missing, or does not hold the 8 corners of a box.
     """
     path = Path(path)
-    try:
+    with contents_of(path, "must hold the 8 corners of a box, each a line or list of x y z"):
         if path.suffix.lower() == ".json":
-            data = json.loads(path.read_text("utf-8-sig"))
+            data = read_json(path)
             corners = np.array(data["corners"] if isinstance(data, dict) else data, np.float64)
         else:
-            lines = [line.split() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
+            lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
             corners = np.array(lines, np.float64)
         return Box.from_corners(corners)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such box file") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: must hold the 8 corners of a box, each a line or list of x y z ({error})"
-        ) from error
 
 
 def estimate_box(model: pycolmap.Reconstruction) -> Box:

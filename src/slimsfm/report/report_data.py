@@ -108,7 +108,7 @@ def load_run_maps(run: Run, result: ObjectResult, method: str) -> RunMaps:
         MapError: A map is missing or damaged.
         InputError: The results are not those of these maps.
     """
-    with contents_of(run.folder / "results.json", _AGAIN):
+    with contents_of(run.folder / "results.json", "damaged", _AGAIN):
         variants = [cell.variant for cell in result.measurements if cell.method == method]
         kept = [one for one in dict.fromkeys(("full", *variants)) if not parse_variant(one).is_random]
         mapped = next(one for one in result.maps if one.method == method)
