@@ -116,7 +116,7 @@ def read_stored_mask(path: str | Path) -> StoredMask:
         ImageError: As in `read_photo`.
     """
     stored = _read(path)
-    kept = stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2)
+    kept = np.asarray(stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2))
     if stored.alpha is not None:
         kept &= stored.alpha > 0
     return StoredMask(mask=_white_where(kept), orientation=stored.orientation)

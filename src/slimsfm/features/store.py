@@ -57,7 +57,8 @@ class FeatureFile(Mapping[str, Features]):
             raise KeyError(name)
         with self._contents_of(name):
             features = _read_features(self._file, name)
-            self._check_kind(*features.descriptors.shape, features.descriptors.dtype)
+            count, length = features.descriptors.shape
+            self._check_kind(count, length, features.descriptors.dtype)
         return features
 
     def count(self, name: str) -> int:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
+from h5py import h5l
 
 from slimsfm.errors import InputError
 from slimsfm.files.atomic import uninterrupted
@@ -36,8 +37,8 @@ def datasets_of(file: h5py.File) -> list[str]:
     """
     names: list[str] = []
 
-    def visit(name: bytes, link: h5py.h5l.LinkInfo) -> None:
-        if link.type != h5py.h5l.TYPE_HARD:
+    def visit(name: bytes, link: h5l.LinkInfo) -> None:
+        if link.type != h5l.TYPE_HARD:
             raise ValueError(f"{name.decode(errors='replace')!r} is a link, which is not followed")
         names.append(name.decode())
 

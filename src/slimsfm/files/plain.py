@@ -13,9 +13,9 @@ def plain(value: Any, hint: Any) -> Any:
 
     Args:
         value: As `json.loads` gives it.
-        hint: bool, int, float, str, None, a `Literal`, `tuple[X, ...]`, `list[X]`, `dict[str, X]`, a union of
-            these, or a dataclass of these. Keys that a dataclass does not have are ignored; later versions
-            may write more.
+        hint: Any, bool, int, float, str, None, a `Literal`, `tuple[X, ...]`, `list[X]`, `dict[str, X]`, or a
+            dataclass of these; each may be optional. Keys that a dataclass does not have are ignored, because
+            later versions may write more.
 
     Returns:
         The value, its numbers finite.
@@ -25,6 +25,8 @@ def plain(value: Any, hint: Any) -> Any:
         KeyError: A field of a dataclass is missing.
     """
     origin, arguments = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return value
     if origin in (Union, UnionType):
         return _plain_union(value, arguments)
     if origin is Literal and value in arguments:

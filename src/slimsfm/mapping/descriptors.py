@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from slimsfm.arrays import Descriptors, Mask
+from slimsfm.errors import MapError
 from slimsfm.features import unit_rows
 from slimsfm.features.nearest import learn_words, vlad
 from slimsfm.files import contents_of, read_npz, unpacked
@@ -137,12 +138,26 @@ def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
 
 
 def descriptor_length(map: Map) -> int | None:
-    """Number of values of the map's descriptors; None if images are matched as a whole."""
+    """Number of values of the map's descriptors; None if images are matched as a whole.
+
+    Raises:
+        MapError: The descriptors of its points, images and vocabulary differ in length.
+    """
     if not map.has_keypoints:
         return None
+    of_images = (one.shape[1] for name in map.features if len(one := map.features[name].descriptors))
+    lengths = [next(of_images, None)]
     if map.point_descriptors is not None:
-        return map.point_descriptors.descriptors.shape[1]
-    return next((one.shape[1] for name in map.images if len(one := map.features[name].descriptors)), None)
+        lengths.append(map.point_descriptors.descriptors.shape[1])
+    if map.global_descriptors is not None:
+        lengths.append(map.global_descriptors.vocabulary.shape[1])
+    known = sorted({length for length in lengths if length is not None})
+    if len(known) > 1:
+        raise MapError(
+            f"the descriptors of the map have {' and '.join(str(one) for one in known)} values, which is impossible; "
+            "build or import it again"
+        )
+    return known[0] if known else None
 
 
 def with_global_descriptors(map: Map) -> Map:
