@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
-from h5py import h5l
+from h5py import h5l  # pyright: ignore[reportAttributeAccessIssue]
 
 from slimsfm.errors import InputError
 from slimsfm.files.atomic import uninterrupted

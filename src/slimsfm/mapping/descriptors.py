@@ -153,10 +153,8 @@ def descriptor_length(map: Map) -> int | None:
         lengths.append(map.global_descriptors.vocabulary.shape[1])
     known = sorted({length for length in lengths if length is not None})
     if len(known) > 1:
-        raise MapError(
-            f"the descriptors of the map have {' and '.join(str(one) for one in known)} values, which is impossible; "
-            "build or import it again"
-        )
+        counts = " and of ".join(str(one) for one in known)
+        raise MapError(f"the map has descriptors of {counts} values; build or import it again")
     return known[0] if known else None
 
 
