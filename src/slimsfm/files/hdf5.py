@@ -35,14 +35,11 @@ def datasets_of(file: h5py.File) -> list[str]:
     Raises:
         ValueError: The file holds links to other names or files.
     """
-    names: list[str] = []
-
-    def visit(name: bytes, link: h5l.LinkInfo) -> None:
-        if link.type != h5l.TYPE_HARD:
-            raise ValueError(f"{name.decode(errors='replace')!r} is a link, which is not followed")
-        names.append(name.decode())
-
-    file.id.links.visit(visit, info=True)
+    links: list[tuple[bytes, int]] = []
+    file.id.links.visit(lambda name, link: links.append((name, link.type)), info=True)
+    names = [name.decode() for name, _ in links]
+    if followed := [name for name, (_, kind) in zip(names, links, strict=True) if kind != h5l.TYPE_HARD]:
+        raise ValueError(f"{followed[0]!r} is a link, which is not followed")
     groups = {name.rpartition("/")[0] for name in names}
     return [name for name in names if name not in groups]
 
@@ -116,14 +113,13 @@ def _check_size(found: h5py.h5d.DatasetID, file_bytes: int) -> None:
 
 def _check_chunks(found: h5py.h5d.DatasetID, unpacked: int) -> None:
     """Check that large chunks unpack to their size: HDF5 unpacks whatever there is."""
-
-    def check(chunk: h5py.h5d.StoreInfo) -> None:
+    chunks: list[h5py.h5d.StoreInfo] = []
+    found.chunk_iter(chunks.append)
+    for chunk in chunks:
         if chunk.size > _SMALL_CHUNK:
             skipped, packed = found.read_direct_chunk(chunk.chunk_offset)
             if not skipped and len(zlib.decompressobj().decompress(packed, unpacked + 1)) > unpacked:
                 raise ValueError(f"a chunk unpacks to more than its {unpacked} bytes")
-
-    found.chunk_iter(check)
 
 
 @contextmanager
