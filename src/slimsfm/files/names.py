@@ -14,7 +14,7 @@ def inside(folder: Path, name: str) -> Path:
         InputError: The name is empty, absolute or leads out of the folder, or no file can have it.
     """
     parts = PurePosixPath(name).parts
-    if not parts or parts[0] == "/" or ".." in parts or "\0" in name:
+    if not parts or name.startswith("/") or ".." in parts or "\0" in name:
         raise InputError(
             f"{name!r}: must be a name inside {folder}, not empty, not absolute, without '..'; rename it"
         )
