@@ -9,6 +9,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from scenes import exact_map, with_matches
+from slimsfm.limits import use_limits
 from slimsfm.mapping.map import Map
 from slimsfm.weights import use_runtime
 
@@ -19,8 +20,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores:
 
 @pytest.fixture(autouse=True)
 def restored_runtime() -> Iterator[None]:
-    """Start each test without a runtime: a command that ran in this process may have left one."""
-    with use_runtime(None):
+    """Start each test without a runtime and limits: a command that ran in this process may have left some."""
+    with use_runtime(None), use_limits(None):
         yield
 
 

@@ -7,6 +7,7 @@ from PIL import ExifTags, Image, ImageCms
 from exif_photos import STORED, save_photo
 from slimsfm.errors import ImageError
 from slimsfm.exif import camera_from_exif, read_exif
+from slimsfm.limits import Limits, use_limits
 from slimsfm.photos import read_image, read_mask, read_photo, read_stored_mask, shrink, upright
 
 UPRIGHT = np.zeros((4, 6, 3), np.uint8)
@@ -155,9 +156,15 @@ def test_an_image_that_is_too_large_is_named_with_the_limit(tmp_path, monkeypatc
     Image.fromarray(np.zeros((2000, 3000), np.uint8)).save(tmp_path / "a.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4_000_000)
     assert read_image(tmp_path / "a.png").shape == (2000, 3000, 3)  # Pillow would warn
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1_000_000)
-    with pytest.raises(ImageError, match=r"a\.png: has 6 megapixels, too large: up to 2 are read; shrink"):
+    with (
+        use_limits(Limits(max_megapixels=5)),
+        pytest.raises(
+            ImageError,
+            match=r"a\.png: has 6 megapixels, more than the limit of 5; shrink it or pass `max_megapixels=6`",
+        ),
+    ):
         read_image(tmp_path / "a.png")
+    assert Image.MAX_IMAGE_PIXELS == 4_000_000
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "P", "LA", "RGB", "RGBA", "I;16", "I", "F", "RGB;16"])

@@ -15,7 +15,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     as_completed,
 )
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from multiprocessing import get_context
 from os import sched_getaffinity
@@ -24,6 +24,7 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from slimsfm.errors import WorkError
+from slimsfm.limits import Limits, chosen_limits, use_limits
 from slimsfm.weights import Runtime, chosen_runtime, use_runtime
 
 Task = TypeVar("Task")
@@ -124,7 +125,7 @@ def run_tasks(
         for index, task in enumerate(tasks):
             yield index, function(task)
         return
-    function = partial(_with_runtime, chosen_runtime(), function)
+    function = partial(_as_here, chosen_runtime(), chosen_limits(), function)
     pending = dict(enumerate(tasks))
     failures: Counter[int] = Counter()
     while pending:
@@ -136,9 +137,15 @@ def run_tasks(
         _check(failures)
 
 
-def _with_runtime(runtime: Runtime | None, function: Callable[[Task], Result], task: Task) -> Result:
-    """Run a task on a worker with the runtime of the process that submits it."""
-    with use_runtime(runtime) if runtime else nullcontext():
+def _as_here(
+    runtime: Runtime | None, limits: Limits | None, function: Callable[[Task], Result], task: Task
+) -> Result:
+    """Run a task on a worker with the runtime and the limits of the process that submits it."""
+    with ExitStack() as restoring:
+        if runtime:
+            restoring.enter_context(use_runtime(runtime))
+        if limits:
+            restoring.enter_context(use_limits(limits))
         return function(task)
 
 

@@ -205,18 +205,11 @@ def check_names(folder: Path, names: Iterable[str]) -> None:
     """Check that the files that hold names of images can hold these.
 
     Raises:
-        InputError: A name has a character that ends a line or is no text, or two are one in files of hloc,
-            in which "/" is "-".
+        InputError: A name has a character that ends a line or is no text.
     """
-    keys: dict[str, str] = {}
     for name in names:
         if any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name):
             raise InputError(
                 f"{folder}: the name {name!r} has a line break or another character that text files "
                 "of names cannot hold; rename the image"
-            )
-        other = keys.setdefault(name.replace("/", "-"), name)
-        if other != name:
-            raise InputError(
-                f"{folder}: {other} and {name} have the same name in files of matches (/ is -); rename one"
             )

@@ -7,25 +7,26 @@ that are no number are black.
 """
 
 import logging
-import re
 import struct
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from io import BufferedReader, BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 from PIL import ExifTags, ImageCms, UnidentifiedImageError
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError
 from slimsfm.image_files import INSTALL_HEIC, can_read_heic
+from slimsfm.limits import check_pixels
 
 Orientation = Literal["upright", "stored"]
 """Which pixels of an image file: turned upright according to its EXIF orientation, or as they are stored, as
@@ -35,6 +36,10 @@ _LOGGER = logging.getLogger(__name__)
 _UNREADABLE = (UnidentifiedImageError, OSError, EOFError, ValueError, SyntaxError, RuntimeError)
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _WIDE = "I", "F"  # first letters of Pillow's modes of more than eight bits
+_STRIP = (
+    256  # rows that are converted at a time, because a large image exists once or twice but not more often
+)
+_PILLOW_LIMIT = Lock()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,10 +116,14 @@ def read_stored_mask(path: str | Path) -> StoredMask:
         ImageError: As in `read_photo`.
     """
     stored = _read(path)
-    kept = stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2)
+    kept = np.asarray(stored.values.reshape(*stored.values.shape[:2], -1).any(axis=2))
     if stored.alpha is not None:
         kept &= stored.alpha > 0
-    return StoredMask(mask=np.where(kept, 255, 0).astype(np.uint8), orientation=stored.orientation)
+    return StoredMask(mask=_white_where(kept), orientation=stored.orientation)
+
+
+def _white_where(kept: Bool[np.ndarray, "h w"]) -> GrayImage:
+    return np.where(kept, np.uint8(255), np.uint8(0))
 
 
 def read_mask(path: str | Path) -> GrayImage:
@@ -178,7 +187,7 @@ def _read(path: str | Path) -> _Stored:
     with reading(path), opened_image(path) as file:
         is_deep = _is_deep(file)  # first, because Pillow forgets the depth when it decodes
         orientation = exif_orientation(file)
-        values, alpha = _deep_values(file, path) if is_deep else None, None
+        values, alpha = (_deep_values(path) if is_deep else None) or (None, None)
         # The other pictures of an MPO, which many phones call JPEG, are previews and gain maps.
         num_frames = 1 if file.format == "MPO" else getattr(file, "n_frames", 1)
         if values is None:
@@ -186,10 +195,8 @@ def _read(path: str | Path) -> _Stored:
             if exif_orientation(file) != orientation:  # Pillow turns TIFF files when it decodes them
                 values = as_stored(values, orientation)
                 alpha = None if alpha is None else as_stored(alpha, orientation)
-        elif values.ndim == 3 and values.shape[2] == 4:
-            values, alpha = values[..., :3], values[..., 3]
         if alpha is not None:
-            alpha = None if alpha.all() else np.where(alpha, 255, 0).astype(np.uint8)
+            alpha = None if alpha.all() else _white_where(alpha > 0)
         return _Stored(values, alpha, orientation, num_frames)
 
 
@@ -199,22 +206,39 @@ def _values(
     """Gray or RGB values and alpha as Pillow decodes them."""
     if file.mode.startswith(_WIDE):
         return np.array(file), None
-    if file.mode == "LAB":
-        lab, rgb = (ImageCms.createProfile(space) for space in ("LAB", "sRGB"))
-        file = ImageCms.profileToProfile(file, lab, rgb, outputMode="RGB") or file
-    if file.has_transparency_data:
-        pixels = np.array(file.convert("RGBA"))
-        return pixels[..., :3], pixels[..., 3]
-    return np.array(file.convert("RGB")), None
+    file.load()
+    if not file.has_transparency_data:
+        return _converted(file, "RGB"), None
+    pixels = _converted(file, "RGBA")
+    return pixels[..., :3], pixels[..., 3]
 
 
-def _deep_values(file: PillowImage.Image, path: str | Path) -> Shaped[np.ndarray, "_ _ _"] | None:
-    """RGB or RGBA of 16 bits per channel, of which Pillow keeps the upper eight; None for other images."""
-    file.load()  # OpenCV takes half a file for a whole one, Pillow does not
+def _converted(file: PillowImage.Image, mode: Literal["RGB", "RGBA"]) -> UInt8[np.ndarray, "_ _ channels"]:
+    found = np.empty((file.height, file.width, len(mode)), np.uint8)
+    for top in range(0, file.height, _STRIP):
+        strip = file.crop((0, top, file.width, min(file.height, top + _STRIP)))
+        if strip.mode == "LAB":
+            lab, rgb = (ImageCms.createProfile(space) for space in ("LAB", "sRGB"))
+            strip = ImageCms.profileToProfile(strip, lab, rgb, outputMode="RGB") or strip
+        found[top : top + _STRIP] = np.asarray(strip.convert(mode))
+    return found
+
+
+def _deep_values(
+    path: str | Path,
+) -> tuple[Shaped[np.ndarray, "_ _ _"], Shaped[np.ndarray, "_ _"] | None] | None:
+    """RGB of 16 bits per channel, of which Pillow keeps the upper eight, and alpha; None for other images."""
+    _check_whole(path)
     found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.dtype != np.uint16 or found.ndim != 3:
         return None
-    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
+    return found[..., 2::-1], found[..., 3] if found.shape[2] == 4 else None
+
+
+def _check_whole(path: str | Path) -> None:
+    """Decode an image by Pillow and forget it: OpenCV takes half a file for a whole one, Pillow does not."""
+    with opened_image(path) as file:
+        file.load()
 
 
 def _is_deep(file: PillowImage.Image) -> bool:
@@ -235,13 +259,21 @@ def _as_rgb(values: Shaped[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h
 
 def _as_bytes(values: Shaped[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Scale values of more than eight bits to eight, by the rule at the top of this module."""
+    strips = [slice(top, top + _STRIP) for top in range(0, len(values), _STRIP)]
     is_float = np.issubdtype(values.dtype, np.floating)
-    values = np.maximum(np.where(np.isfinite(values), values, 0) if is_float else values, 0)
-    most = values.max(initial=0)
-    if is_float and most <= 1:
-        return np.round(255 * values).astype(np.uint8)
-    bits = max(8, int(most).bit_length())
-    return (values // 2 ** (bits + bits % 2 - 8)).astype(np.uint8)
+    most = max((_not_negative(values[strip]).max(initial=0) for strip in strips), default=0)
+    bits = 0 if is_float and most <= 1 else max(8, int(most).bit_length())
+    found = np.empty(values.shape, np.uint8)
+    for strip in strips:
+        kept = _not_negative(values[strip])
+        found[strip] = kept // 2 ** (bits + bits % 2 - 8) if bits else np.round(255 * kept)
+    return found
+
+
+def _not_negative(values: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
+    if np.issubdtype(values.dtype, np.floating):
+        values = np.where(np.isfinite(values), values, 0)
+    return np.maximum(values, 0)
 
 
 @contextmanager
@@ -249,17 +281,40 @@ def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
     """Open an image file by Pillow, HEIC included.
 
     Raises:
-        ImageError: It is a HEIC photo, and the package for them is missing.
+        ImageError: It is a HEIC photo, and the package for them is missing, or it has more pixels than the
+            limit.
     """
     with Path(path).open("rb") as raw:  # given a path, Pillow maps TIFF into memory and mixes up turned ones
         head = raw.read(12)
         if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
             raise ImageError(f"{path}: {INSTALL_HEIC}")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PillowImage.DecompressionBombWarning)
-            file = PillowImage.open(raw)
-        with file:
+        with _open(raw) as file:
+            check_pixels(path, *file.size)
             yield file
+
+
+def decode_jpeg(data: UInt8[np.ndarray, " bytes"], source: str) -> Image:
+    """Decode a JPEG file in memory.
+
+    Raises:
+        ImageError: It is damaged, or has more pixels than the limit; the message names the source.
+    """
+    with reading(source), _open(BytesIO(data.tobytes())) as file:
+        check_pixels(source, *file.size)
+        photo = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if file.format == "JPEG" else None
+        if photo is None:
+            raise ValueError("not a JPEG file")
+    return np.asarray(photo, np.uint8)
+
+
+def _open(raw: BufferedReader | BytesIO) -> PillowImage.Image:
+    """Open an image of any size. Pillow's own limit, a global, warns of images that ours allows."""
+    with _PILLOW_LIMIT:
+        limit, PillowImage.MAX_IMAGE_PIXELS = PillowImage.MAX_IMAGE_PIXELS, None
+        try:
+            return PillowImage.open(raw)
+        finally:
+            PillowImage.MAX_IMAGE_PIXELS = limit
 
 
 @cache
@@ -280,11 +335,6 @@ def reading(path: str | Path) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise ImageError(f"{path}: no such image") from error
-    except PillowImage.DecompressionBombError as error:
-        has, most = (int(number) / 1e6 for number in re.findall(r"\d+", str(error))[:2])
-        raise ImageError(
-            f"{path}: has {has:.0f} megapixels, too large: up to {most:.0f} are read; shrink the image"
-        ) from error
     except _UNREADABLE as error:
         raise ImageError(
             f"{path}: not a readable image: damaged, or of a kind that is not supported; convert, replace or "

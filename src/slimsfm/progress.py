@@ -145,7 +145,12 @@ class TerminalBars:
         if self._running is not None:  # a loop inside another one: its bar goes below
             yield from _with_bar(self._running, items, label)
             return
-        columns = (TextColumn("{task.description}"), BarColumn(), _Counts(), TimeRemainingColumn())
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            _Counts(),
+            TimeRemainingColumn(),
+        )
         with Progress(*columns, console=self.console, transient=True) as self._running:
             try:
                 yield from _with_bar(self._running, items, label)

@@ -69,7 +69,7 @@ def test_files_follow_the_published_conventions(tmp_path):
 
 
 DAMAGES = {
-    "no box": ("box3d_corners.txt", None, "no such box file"),
+    "no box": ("box3d_corners.txt", None, "no such file"),
     "seven corners": ("box3d_corners.txt", "0 0 0\n" * 7, "8 points"),
     "flat box": ("box3d_corners.txt", "0 0 0\n" * 8, "half_edges"),
     "no intrinsics": ("cup-1/intrinsics.txt", None, "cannot be read"),

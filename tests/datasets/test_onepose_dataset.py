@@ -97,7 +97,7 @@ def test_a_video_with_more_frames_than_poses_is_an_error(published, making, writ
 
 PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0"
 DAMAGES = {
-    "no box": ("full", "box3d_corners.txt", None, "no such box file"),
+    "no box": ("full", "box3d_corners.txt", None, "no such file"),
     "box of words": ("full", "box3d_corners.txt", "a b c\n" * 8, "8 corners"),
     "no intrinsics": ("full", "colorbox-1/intrinsics.txt", None, "there is no such file"),
     "no focal length": ("full", "colorbox-1/intrinsics.txt", "fx: 0\nfy: 1\ncx: 1\ncy: 1", "positive focal"),

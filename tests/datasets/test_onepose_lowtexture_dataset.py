@@ -58,7 +58,7 @@ def test_it_can_be_pickled(published):
 CUT = b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
 ENDLESS = CUT + b"property float z\nend_header\n0 0 0\n"
 DAMAGES = {
-    "no box": ("box3d_corners.txt", None, "no such box file"),
+    "no box": ("box3d_corners.txt", None, "no such file"),
     "no ply": ("model_eval.ply", b"solid model", "cannot be read as a PLY file"),
     "cut header": ("model_eval.ply", CUT, "cannot be read as a PLY file"),
     "cut vertices": ("model_eval.ply", ENDLESS, "PLY file|four finite vertices"),

@@ -161,7 +161,7 @@ def test_matches_come_back_as_they_were(tmp_path):
         rows = np.sort(rng.permutation(counts[a])[:size])
         matches[a, b] = np.stack([rows, rng.permutation(counts[b])[:size]], axis=1).astype(np.int64)
     write_matches(tmp_path / "matches.h5", matches, counts)
-    read = MatchFile(tmp_path / "matches.h5", NAMES)
+    read = MatchFile(tmp_path / "matches.h5", NAMES, counts)
     assert list(read) == sorted(matches)
     assert len(read) == 4
     for pair, expected in matches.items():
@@ -204,7 +204,7 @@ def test_names_that_hdf5_spells_otherwise_come_back(tmp_path):
 
 def test_matches_tell_names_apart_that_hloc_does_not(tmp_path):
     names = ["a-b.png", "a/b.png", "a-b/c.png", "a/b/c.png", "a/b-c.png"]
-    assert indistinct_names(names) == ["a/b-c.png", "a/b.png", "a/b/c.png"]
+    assert indistinct_names(names) == sorted(names)
     assert indistinct_names(NAMES) == []
     pairs = [(a, b) for a in names for b in names if a < b]
     matches = {pair: np.array([[i, i]]) for i, pair in enumerate(pairs)}

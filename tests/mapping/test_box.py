@@ -63,7 +63,7 @@ def test_text_without_a_box_is_an_input_error(tmp_path, text):
 
 
 def test_a_missing_box_and_a_folder_are_input_errors(tmp_path):
-    with pytest.raises(InputError, match="no such box file"):
+    with pytest.raises(InputError, match="no such file"):
         read_box(tmp_path / "box.json")
     with pytest.raises(InputError, match="must hold"):
         read_box(tmp_path)

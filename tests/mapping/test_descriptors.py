@@ -112,7 +112,7 @@ def test_a_file_with_a_bad_byte_is_read_correctly_or_refused(written):
 
 @pytest.mark.parametrize("num_points", [0, 1, 78])
 def test_a_file_of_another_model_is_refused(written, num_points):
-    with pytest.raises(InputError, match=f"do not belong to {num_points} points"):
+    with pytest.raises(InputError, match=r"points.npz: damaged .*(hold more than|do not belong to)"):
         read_point_descriptors(written, num_points)
     assert len(read_point_descriptors(written, 79).points) == 40
 

@@ -255,7 +255,7 @@ def test_pairs_that_hloc_would_misread_are_refused(exact, tmp_path):
 
 def test_names_that_hloc_takes_for_one_are_refused(exact, tmp_path):
     names = ["a-b.png", "a/b.png", *NAMES[2:]]
-    with pytest.raises(InputError, match=r"'a/b\.png': hloc's matches cannot tell this name from another"):
+    with pytest.raises(InputError, match=r"'a[-/]b\.png': hloc's matches cannot tell this name from another"):
         write_hloc(renamed(exact, names), tmp_path / "out")
     assert contents(tmp_path) == {}
 

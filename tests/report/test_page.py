@@ -193,9 +193,7 @@ def test_six_objects_of_sixty_photos_fit_into_fifteen_megabytes(html, run, tmp_p
     photo = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
     Image.fromarray(photo).save(tmp_path / "photo.png")
     limits = report_budget(6, 60)
-    sizes = [
-        len(photo_uri(tmp_path / "photo.png", side) or "") for side in (limits.photo_px, limits.frame_px)
-    ]
+    sizes = [len(photo_uri(tmp_path, "photo.png", side) or "") for side in (limits.photo_px, limits.frame_px)]
     each = 2 * limits.points * BYTES_PER_POINT + 60 * sizes[0] + limits.frames * sizes[1]
     assert limits.photo_px >= 64
     assert 6 * (each + len(html) / len(run.objects)) < 15e6

@@ -133,9 +133,9 @@ def run(arguments: Sequence[str]) -> int:
     try:
         _run_command(arguments)
     except SlimsfmError as error:
-        from slimsfm.cli.parsing import with_flags
+        from slimsfm.cli.parsing import printable, with_flags
 
-        print(f"slimsfm: {with_flags(str(error))}", file=sys.stderr)
+        print(f"slimsfm: {printable(with_flags(str(error)))}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt as interruption:
         outcome = str(interruption) or "no incomplete output was left behind"

@@ -1,4 +1,4 @@
-"""Arguments that commands share: where work and networks run."""
+"""Arguments that commands share: where work and networks run, and what is read."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from slimsfm.execution import OpenExecutor, dask_cluster, num_cores, processes
+from slimsfm.limits import Limits, use_limits
 from slimsfm.weights import Runtime, use_runtime
 
 
@@ -60,3 +61,19 @@ class Networks:
             InputError: The folder does not exist.
         """
         use_runtime(Runtime.from_environment(self.weights, self.device))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """Limits on what is read."""
+
+    max_megapixels: float | None = None
+    """Largest image that is read, by default $SLIMSFM_MAX_MEGAPIXELS, else 120, which take 1 GB of memory."""
+
+    def apply(self) -> None:
+        """Use these for all files that the command reads, also in its worker processes.
+
+        Raises:
+            InputError: A limit is not a positive number.
+        """
+        use_limits(Limits.from_environment(self.max_megapixels))

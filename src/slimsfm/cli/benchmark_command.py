@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.arguments import Execution, Networks, resumable
+from slimsfm.cli.arguments import Execution, Networks, Reading, resumable
 from slimsfm.cli.options import Advanced, Argument, OutputPath, Positional, Prefixed, Typed
 from slimsfm.cli.output import Stopwatch, console, finish, plural
 from slimsfm.cli.tables import print_comparisons, print_summary, print_support
@@ -25,6 +25,7 @@ def benchmark(
     comparison: Annotated[BenchmarkOptions, Advanced(("edges", "reduction"))] = BenchmarkOptions(),
     build: Annotated[BuildOptions, Prefixed, Advanced()] = BuildOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     execution: Annotated[Execution, Advanced()] = Execution(workers=1),
     overwrite: bool = False,
     *,
@@ -40,12 +41,14 @@ def benchmark(
         comparison: What is compared.
         build: How maps are built from photos. Extractor and matcher come from the methods.
         networks: Where learned methods run.
+        reading: Limits on what is read.
         execution: Where objects are measured. Times are comparable only with one worker, the default.
         overwrite: Start from scratch if the output contains a run with other options.
         command: The command line, which is part of the results.
     """
     watch = Stopwatch()
     networks.apply()
+    reading.apply()
     if (build.extractor, build.matcher) != (BuildOptions().extractor, BuildOptions().matcher):
         raise InputError("build.extractor and build.matcher are ignored; use `methods=EXTRACTOR+MATCHER`")
     check_place(output)

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks
+from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map, plural
 from slimsfm.files.work_folder import work_folder
@@ -20,6 +20,7 @@ def build_photos(
         BuildOptions()
     ),
     networks: Annotated[Networks, Advanced()] = Networks(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     overwrite: bool = False,
 ) -> None:
     """Build a map from a folder of photos.
@@ -29,10 +30,12 @@ def build_photos(
         output: Folder of the map.
         build: How to build the map.
         networks: Where learned methods run.
+        reading: Limits on what is read.
         overwrite: Replace an existing map.
     """
     watch = Stopwatch()
     networks.apply()
+    reading.apply()
     needed = bytes_to_build(images, build)
     check_output(output, images, build.masks, build.box, overwrite=overwrite, least_bytes=needed)
     with work_folder(output) as workspace:

@@ -71,7 +71,7 @@ def export_colmap(map: MapPath, /, output: OutputPath, overwrite: bool = False) 
 def _print_left_out(exported: Map) -> None:
     if mirrored := mirrored_images(exported):
         text = named("image(s) left out, because their EXIF orientation mirrors them", mirrored)
-        console.print(text, style="yellow", markup=False)
+        console.print(text, style="yellow")
 
 
 def export_hloc(

@@ -22,10 +22,10 @@ def info(map: MapPath, /, json: bool = False, images: bool = False) -> None:
         print(json_format.dumps(_facts(map_, sizes), indent=2))
         return
     for name, text in _lines(map_, sizes).items():
-        console.print(f"{name:<14}{text}", markup=False)
+        console.print(f"{name:<14}{text}")
     print_notes(map_)
     if images:
-        console.print(f"{'image names':<14}{', '.join(map_.images)}", markup=False)
+        console.print(f"{'image names':<14}{', '.join(map_.images)}")
 
 
 def _facts(map: Map, sizes: dict[str, int]) -> dict:

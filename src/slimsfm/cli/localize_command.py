@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks
+from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.errors import InputError
@@ -34,6 +34,7 @@ def localize(
     full: Path | None = None,
     localization: Annotated[LocalizationOptions, Advanced(("matching", "ransac"))] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     camera: Path | None = None,
     gravity: Path | None = None,
     workers: int | None = None,
@@ -50,6 +51,7 @@ def localize(
         full: The full map that the map was reduced from, for images that the reduced one gives no pose.
         localization: How to localize.
         networks: Where learned methods run.
+        reading: Limits on what is read.
         camera: Intrinsics of the images in COLMAP's cameras.txt format. Without it, those of the map where
             size and EXIF fit, else from EXIF; else the focal length is estimated.
         gravity: Direction of gravity as JSON: {"world": [x, y, z], "images": {NAME: [x, y, z]}}, in the frame
@@ -60,6 +62,7 @@ def localize(
     """
     watch = Stopwatch()
     networks.apply()
+    reading.apply()
     check_output(output, map, images, *also, full, camera, gravity, overwrite=overwrite)
     writer_for(output, several=bool(also))
     _check_options(workers, also, gravity=gravity, full=full)
@@ -118,7 +121,7 @@ def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collectio
     images = list(next(iter(by_object.values())))
     every = (one for results in by_object.values() for one in results.values())
     for note in dict.fromkeys(note for one in every for note in one.camera_notes):
-        console.print(f"note: {note}", style="yellow", markup=False)
+        console.print(f"note: {note}", style="yellow")
     for image in images:
         for key, results in by_object.items():
             name = f"{image}, {key}" if len(by_object) > 1 else image

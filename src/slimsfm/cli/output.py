@@ -8,8 +8,9 @@ from typing import Any
 
 import pycolmap
 from rich.console import Console
+from rich.text import Text
 
-from slimsfm.cli.parsing import with_flags
+from slimsfm.cli.parsing import printable, with_flags
 from slimsfm.errors import OutputError
 from slimsfm.files import check_writable
 from slimsfm.files.space import check_place
@@ -19,12 +20,17 @@ _WIDTH = 170  # of the widest table; a narrower terminal wraps lines, but no num
 
 
 class _Console(Console):
+    """Prints text as it is: names of files are neither markup nor emoji nor commands to the terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
     def on_broken_pipe(self) -> None:
         """Leave it to the command line, as `print` does."""
         raise BrokenPipeError
 
 
-console = _Console(highlight=False, markup=False, soft_wrap=True, width=_WIDTH)
+console = _Console(highlight=False, markup=False, emoji=False, soft_wrap=True, width=_WIDTH)
 
 
 def check_output(output: Path, *sources: Path | None, overwrite: bool, least_bytes: int = 0) -> None:
@@ -95,14 +101,14 @@ def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:
 def print_notes(map: Map) -> None:
     """Print what was skipped, ignored or guessed when a map was made, and what contradicts it."""
     for note in map.info.notes:
-        console.print(f"note: {with_flags(note)}", style="yellow", markup=False)
+        console.print(f"note: {with_flags(note)}", style="yellow")
     print_warnings(map)
 
 
 def print_warnings(map: Map) -> None:
     """Print why a map is in doubt."""
     for warning in map.info.quality.warnings if map.info.quality else ():
-        console.print(f"warning: {warning}", style="bold red", markup=False)
+        console.print(f"warning: {warning}", style="bold red")
 
 
 def finish_map(made: Map, output: Path, watch: Stopwatch) -> None:

@@ -76,6 +76,14 @@ def nearest(word: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Escape characters that a terminal obeys instead of showing them: names come from files."""
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
 def with_flags(message: str) -> str:
     """Write the options that a message of the library names, such as `overwrite=True`, as flags."""
     return re.sub(r"`(\w+)=(?:True|'([^']+)'|(\w+))`", _flag, message)

@@ -225,14 +225,14 @@ def print_support(results: Sequence[ObjectResult]) -> None:
     for result in results:
         for mapped in result.maps:
             if mapped.quality:
-                console.print(f"{result.name}, {mapped.method}: {mapped.quality.summary}", markup=False)
+                console.print(f"{result.name}, {mapped.method}: {mapped.quality.summary}")
     print_map_warnings(results)
 
 
 def print_map_warnings(results: Sequence[ObjectResult]) -> None:
     """Print why the maps that results were measured with are in doubt."""
     for name, method, why in map_warnings(results):
-        console.print(f"warning: {name}, {method}: {why}", style="bold red", markup=False)
+        console.print(f"warning: {name}, {method}: {why}", style="bold red")
 
 
 def _dominating_sets(one: DominationSummary) -> str:

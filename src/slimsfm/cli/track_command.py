@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks
+from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
@@ -30,6 +30,7 @@ def track(
     localization: Annotated[LocalizationOptions, Advanced()] = LocalizationOptions(),
     networks: Annotated[Networks, Advanced()] = Networks(),
     strict: bool = False,
+    reading: Annotated[Reading, Advanced()] = Reading(),
     overwrite: bool = False,
 ) -> None:
     """Track an object through a video and write the camera pose of every frame.
@@ -45,10 +46,12 @@ def track(
         localization: How to localize.
         networks: Where learned methods run.
         strict: Stop at the first frame that cannot be used, and write nothing.
+        reading: Limits on what is read.
         overwrite: Replace existing outputs.
     """
     watch = Stopwatch()
     networks.apply()
+    reading.apply()
     for path in (output, video) if video else (output,):
         check_output(path, map, Path(source), camera, overwrite=overwrite)
     writer_for(output)
@@ -75,7 +78,7 @@ def track(
     write_poses(output, poses, seconds=seconds, overwrite=overwrite)
     _sum_up(output, list(frames.values()))
     if tracked.ended_early:
-        console.print(f"warning: {tracked.ended_early}", style="bold red", markup=False)
+        console.print(f"warning: {tracked.ended_early}", style="bold red")
     left_out = f", {len(tracked.skipped)} skipped" if tracked.skipped else ""
     finish(f"{video or output}: {plural(len(poses), 'frame')}{left_out}", watch)
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from time import sleep
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks
+from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, MapPath
 from slimsfm.cli.output import console, print_warnings
 from slimsfm.errors import InputError
@@ -22,6 +22,7 @@ def view(
     camera: Path | None = None,
     focal: FocalLength = "auto",
     networks: Annotated[Networks, Advanced()] = Networks(),
+    reading: Annotated[Reading, Advanced()] = Reading(),
     port: int = 8080,
     host: str = "localhost",
 ) -> None:
@@ -36,6 +37,7 @@ def view(
             size and EXIF fit, else from EXIF; else the focal length is estimated.
         focal: How far the queries' focal length is believed, as in localize.
         networks: Where learned methods run.
+        reading: Limits on what is read.
         port: Port of the view; 0 picks a free one.
         host: Address of the view: localhost serves this machine only, 0.0.0.0 the whole network, to those who
             have the printed address: it then holds a token.
@@ -47,6 +49,7 @@ def view(
             f"view needs {error.name}, which is not installed: pip install 'slimsfm[view]'"
         ) from error
     networks.apply()
+    reading.apply()
     if images and not images.is_dir():
         raise InputError(f"{images}: no such folder of images")
     given = read_camera(camera) if camera else None

@@ -1,7 +1,9 @@
 """The interface of data sets: objects with images to map and to localize, and models of objects."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -12,6 +14,7 @@ from scipy.spatial.distance import pdist
 
 from slimsfm.arrays import Points3D
 from slimsfm.errors import InputError
+from slimsfm.files import contents_of, inside, read_bytes
 from slimsfm.geometry import Box
 from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map
 from slimsfm.mapping.map import Map
@@ -117,14 +120,13 @@ def read_vertices(path: Path) -> Points3D:
     """
     from trimesh.exchange.ply import load_ply  # slow to import, and few data sets have models
 
-    try:
-        with path.open("rb") as file:
-            found = load_ply(file, fix_texture=False, skip_materials=True)["vertices"]
-            vertices = np.array(found, np.float64)
-    except FileNotFoundError as error:
-        raise InputError(f"{path} cannot be read: there is no such file") from error
-    except Exception as error:  # trimesh raises many kinds of errors for damaged files
-        raise InputError(f"{path} cannot be read as a PLY file: {error}") from error
+    with contents_of(path, "cannot be read as a PLY file"):
+        data = read_bytes(path)
+        found = load_ply(BytesIO(data), fix_texture=False, skip_materials=True)["vertices"]
+        vertices = np.array(found, np.float64)
+        stated = re.search(rb"^element\s+vertex\s+(\d+)\s*$", data, re.MULTILINE)
+        if stated is None or int(stated[1]) != len(vertices):
+            raise ValueError(f"{len(vertices)} vertices are not as many as it states")
     shape = vertices.shape
     if len(shape) != 2 or shape[1] != 3 or shape[0] < _FEWEST_VERTICES or not np.all(np.isfinite(vertices)):
         raise InputError(f"{path} must hold at least four finite vertices, got shape {shape}")
@@ -163,7 +165,7 @@ class PosedSequence:
     @property
     def image_paths(self) -> tuple[Path, ...]:
         """Paths of the image files."""
-        return tuple(self.folder / name for name in self.names)
+        return tuple(inside(self.folder, name) for name in self.names)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,7 +4,6 @@ Intrinsic matrices in files follow OpenCV, where the center of the top-left pixe
 is the value in the file plus 0.5; `pinhole_camera` adds it for all data sets.
 """
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,8 +14,10 @@ import pycolmap
 from jaxtyping import Float64
 from PIL import Image as PilImage
 
+from slimsfm import files
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import stored_size
+from slimsfm.files import contents_of
 from slimsfm.lenses import camera_fault
 from slimsfm.photos import Orientation, exif_orientation, opened_image
 
@@ -102,12 +103,8 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: The file is missing or not text.
     """
-    try:
-        return path.read_text("utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(f"{path} cannot be read: there is no such file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
+    with contents_of(path, "cannot be read as text"):
+        return files.read_text(path)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -116,10 +113,8 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         InputError: The file is missing or damaged, or does not hold a JSON object.
     """
-    try:
-        data = json.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}") from error
+    with contents_of(path, "cannot be read as JSON"):
+        data = files.read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object, got a {type(data).__name__}")
     return data

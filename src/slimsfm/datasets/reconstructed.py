@@ -17,6 +17,7 @@ from pathlib import Path
 from slimsfm.datasets.base import TWO_VIEWS, LoadOptions, ObjectSequences, PosedSequence
 from slimsfm.datasets.reading import check_object_name, image_size, read_text
 from slimsfm.errors import ImageError, InputError
+from slimsfm.files import inside
 from slimsfm.image_files import find_images, is_image, list_images
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
@@ -139,8 +140,8 @@ class Colmap:
         )
 
     def _check_image(self, truth: Map, name: str) -> None:
-        path, camera, orientation = self.images / name, truth.camera(name), truth.info.orientation
-        if (size := image_size(path, orientation)) != (camera.width, camera.height):
+        path, camera = inside(self.images, name), truth.camera(name)
+        if (size := image_size(path, truth.info.orientation)) != (camera.width, camera.height):
             raise ImageError(
                 f"{path} has {size[0]}x{size[1]} pixels, but its camera in the model "
                 f"{camera.width}x{camera.height}: pass the images that the model was computed from"

@@ -22,23 +22,15 @@ from slimsfm.evaluation.comparison import (
     summarize_domination,
 )
 from slimsfm.evaluation.formats import csv_queries, csv_table, latex_table, markdown_page
-from slimsfm.evaluation.results import (
-    MappedObject,
-    MapRun,
-    Measurement,
-    ObjectResult,
-    Outcomes,
-    PosedQuery,
-    Run,
-)
+from slimsfm.evaluation.result_parsing import object_from_json
+from slimsfm.evaluation.results import MapRun, ObjectResult, PosedQuery, Run
 from slimsfm.evaluation.table import Row, all_rows
-from slimsfm.files import replacing
-from slimsfm.geometry import Box
-from slimsfm.mapping.quality import quality_from_json
+from slimsfm.files import contents_of, plain, read_json, replacing
+from slimsfm.graph.edge_sources import Edges
 
 RESULT_FORMAT_VERSION = 1
 
-_DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError)
+_NO_RESULT, _AGAIN = "not a result of slimsfm benchmark", "run the benchmark again"
 
 
 def write_json(path: Path, data: dict) -> None:
@@ -69,48 +61,6 @@ def object_to_json(result: ObjectResult) -> dict:
     }
 
 
-def object_from_json(data: dict) -> ObjectResult:
-    """The results of an object, from plain values.
-
-    Raises:
-        ValueError: The number of outcomes differs from the number of queries.
-    """
-    found = ObjectResult(
-        name=data["name"],
-        box=Box(**{key: np.array(values, np.float64) for key, values in data["box"].items()}),
-        unit=data["unit"],
-        images=Path(data["images"]),
-        queries=tuple(_query_from_json(one) for one in data["queries"]),
-        maps=tuple(_mapped_from_json(one) for one in data["maps"]),
-        measurements=tuple(
-            Measurement(
-                method=one["method"],
-                strategy=one["strategy"],
-                variant=one["variant"],
-                map_runs=tuple(_map_run_from_json(run) for run in one["trials"]),
-            )
-            for one in data["cells"]
-        ),
-        skipped=dict(data.get("skipped_queries", {})),
-    )
-    counts = {len(run.outcomes) for one in found.measurements for run in one.map_runs}
-    if counts - {len(found.queries)}:
-        raise ValueError(f"{len(found.queries)} queries, but {sorted(counts)} outcomes")
-    return found
-
-
-def _mapped_from_json(data: dict) -> MappedObject:
-    """Results of earlier versions have neither quality nor notes."""
-    return MappedObject(
-        **{
-            **data,
-            "dominating_set": tuple(data["dominating_set"]),
-            "quality": quality_from_json(data.get("quality")),
-            "notes": tuple(data.get("notes", ())),
-        }
-    )
-
-
 def _query_to_json(query: PosedQuery) -> dict:
     camera = query.camera
     return {
@@ -124,15 +74,6 @@ def _query_to_json(query: PosedQuery) -> dict:
         "cam_from_world": _pose_to_json(query.cam_from_world),
         **({"orientation": query.orientation} if query.orientation != "upright" else {}),
     }
-
-
-def _query_from_json(data: dict) -> PosedQuery:
-    return PosedQuery(
-        path=Path(data["path"]),
-        camera=pycolmap.Camera(**data["camera"]),
-        cam_from_world=_pose_from_json(data["cam_from_world"]),
-        orientation=data.get("orientation", "upright"),
-    )
 
 
 def _map_run_to_json(run: MapRun) -> dict:
@@ -151,40 +92,12 @@ def _map_run_to_json(run: MapRun) -> dict:
     }
 
 
-def _map_run_from_json(data: dict) -> MapRun:
-    return MapRun(
-        references=data["references"],
-        points=data["points"],
-        map_bytes=data["map_bytes"],
-        outcomes=Outcomes(
-            error=_numbers(data["error"], np.inf),
-            rotation_deg=_numbers(data["rotation_deg"], np.inf),
-            translation=_numbers(data["translation"], np.inf),
-            confidence=_numbers(data["confidence"], np.nan),
-            references=np.array(data["references_tried"], np.int64),
-            seconds=np.array(data["seconds"], np.float64).reshape(-1, 3),
-            cam_from_world=tuple(
-                None if pose is None else _pose_from_json(pose) for pose in data["cam_from_world"]
-            ),
-        ),
-    )
-
-
 def _pose_to_json(cam_from_world: pycolmap.Rigid3d) -> list[float]:
     return [*cam_from_world.rotation.quat.tolist(), *cam_from_world.translation.tolist()]
 
 
-def _pose_from_json(numbers: list[float]) -> pycolmap.Rigid3d:
-    x, y, z, w, *translation = numbers
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(translation))
-
-
 def _finite(values: np.ndarray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in values.tolist()]
-
-
-def _numbers(values: Sequence[float | None], missing: float) -> np.ndarray:
-    return np.array([missing if value is None else value for value in values], np.float64)
 
 
 def digest_of(objects: Sequence[ObjectResult]) -> str:
@@ -219,12 +132,8 @@ def read_object_result(path: Path) -> ObjectResult:
     Raises:
         InputError: The file is damaged.
     """
-    try:
-        return object_from_json(json.loads(path.read_text(encoding="utf-8")))
-    except _DAMAGED as error:
-        raise InputError(
-            f"{path}: not a result of slimsfm benchmark ({error!r}); delete it and run the benchmark again"
-        ) from error
+    with contents_of(path, _NO_RESULT, f"delete it and {_AGAIN}"):
+        return object_from_json(read_json(path))
 
 
 def read_run(folder: Path) -> Run:
@@ -239,25 +148,36 @@ def read_run(folder: Path) -> Run:
     path = folder if folder.suffix == ".json" else folder / "results.json"
     if not path.is_file():
         raise InputError(f"{path}: no such file; pass the folder of a run of slimsfm benchmark")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+    with contents_of(path, _NO_RESULT, _AGAIN):
+        data = read_json(path)
         if data["format"] != RESULT_FORMAT_VERSION:
             raise InputError(
-                f"{path}: has format {data['format']}, expected {RESULT_FORMAT_VERSION}; "
-                "run the benchmark again"
+                f"{path}: has format {data['format']!r}, expected {RESULT_FORMAT_VERSION}; {_AGAIN}"
             )
+        objects = tuple(object_from_json(one) for one in data["objects"])
+        if len({one.name for one in objects}) < len(objects):
+            raise ValueError("an object occurs twice")
         return Run(
             folder=path.parent,
-            dataset=data["dataset"],
-            options=data["options"],
-            environment=data["environment"],
-            objects=tuple(object_from_json(one) for one in data["objects"]),
-            failed=data["failed"],
+            dataset=plain(data["dataset"], str),
+            options=_options_from_json(data["options"]),
+            environment=plain(data["environment"], dict[str, str]),
+            objects=objects,
+            failed=plain(data["failed"], dict[str, str]),
         )
-    except _DAMAGED as error:
-        raise InputError(
-            f"{path}: not a result of slimsfm benchmark ({error!r}); run the benchmark again"
-        ) from error
+
+
+def _options_from_json(options: Any) -> dict:
+    """Any plain values, but those that the reference graph depends on are of their types."""
+    if not isinstance(options, dict):
+        raise ValueError("the options are no table")
+    json.dumps(options, allow_nan=False, ensure_ascii=False).encode()
+    plain(options.get("command", ""), str)
+    plain(options.get("edges", "localize"), Edges)
+    threshold = plain(options.get("reduction", {}).get("threshold", 1.0), float)
+    if threshold <= 0:
+        raise ValueError(f"a threshold of {threshold}")
+    return options
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,12 @@ from scipy.spatial import KDTree
 
 from slimsfm.arrays import Points3D
 from slimsfm.datasets.base import ObjectModel, PosedSequence
-from slimsfm.features import Features, load_extractor
+from slimsfm.features import Features
+from slimsfm.files import inside
 from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_error
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.localization.strategy import MatchingOptions
+from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation, read_image, read_photo
@@ -238,12 +240,12 @@ class Run:
 
 def map_path(folder: Path, name: str, method: str, variant: str) -> Path:
     """Folder of one map of an object, inside the folder of a run."""
-    return maps_path(folder, name) / method / variant.replace(":", "-")
+    return inside(maps_path(folder, name) / method, variant.replace(":", "-"))
 
 
 def maps_path(folder: Path, name: str) -> Path:
     """Folder of all maps of an object, inside the folder of a run."""
-    return folder / "maps" / name
+    return inside(folder / "maps", name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -389,7 +391,7 @@ def prepare_queries(
     map: Map, queries: Sequence[PosedQuery], progress: ProgressBar = silent
 ) -> list[PreparedQuery]:
     """Extract the features of queries with the extractor of the map."""
-    extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+    extractor = extractor_of(map)
     prepared = []
     for query in progress(queries, "extract query features"):
         photo = read_photo(query.path, query.orientation)

@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from slimsfm.datasets.base import Dataset
-from slimsfm.errors import OutputError, SlimsfmError
+from slimsfm.errors import InputError, OutputError, SlimsfmError
 from slimsfm.evaluation.benchmark import BenchmarkSetup, benchmark_object
 from slimsfm.evaluation.result_files import (
     RESULT_FORMAT_VERSION,
@@ -23,7 +23,7 @@ from slimsfm.evaluation.result_files import (
 )
 from slimsfm.evaluation.results import Run, maps_path
 from slimsfm.execution import OpenExecutor, run_tasks
-from slimsfm.files import locked, remove
+from slimsfm.files import contents_of, inside, locked, read_json, remove
 from slimsfm.progress import ProgressBar, silent
 
 _LOGGER = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ def _measure_all(
 
 def object_path(folder: Path, name: str) -> Path:
     """File with the results of a finished object, inside the folder of a run."""
-    return folder / "objects" / f"{name}.json"
+    return inside(folder / "objects", f"{name}.json")
 
 
 def _measure(task: _Task) -> str | None:
@@ -177,8 +177,9 @@ def _is_empty(folder: Path) -> bool:
 
 def _read_description(path: Path) -> dict | None:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        with contents_of(path, "is no run"):
+            found = read_json(path)
+    except InputError:
         return None
     return found if isinstance(found, dict) and "format" in found else None
 

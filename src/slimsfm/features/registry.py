@@ -5,16 +5,16 @@ Entries hold import paths, not classes: naming a method does not import what the
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from slimsfm.errors import InputError
 from slimsfm.features.base import Extractor, Matcher, NearestOptions
-from slimsfm.files import replacing
+from slimsfm.files import plain, replacing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,9 +155,22 @@ def load_method(kind: str, registry: dict[str, str], name: str, options: dict | 
     known = {**plugins(kind), **registry}
     try:
         with importing(f"{kind} {name!r}"):
-            return load_object(known[name])(**(options or {}))
+            made = load_object(known[name])
+        _check_types(made, options or {})
+        with importing(f"{kind} {name!r}"):
+            return made(**(options or {}))
     except (TypeError, ValueError) as error:
         raise InputError(f"{kind} {name!r}: {error}") from error
+
+
+def _check_types(kind: Any, options: dict) -> None:
+    """Check options, which may come from a file, against the fields of a dataclass."""
+    hints = get_type_hints(kind) if is_dataclass(kind) else {}
+    for name, value in options.items():
+        try:
+            plain(value, hints.get(name, Any))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
 
 
 def _check_known(kind: str, name: str, builtin: Collection[str]) -> None:

@@ -13,8 +13,9 @@ hloc puts the center of the top-left pixel at (0, 0), everything else in slimsfm
 module converts.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 import h5py
@@ -22,14 +23,14 @@ import numpy as np
 from jaxtyping import Float32, Integer
 
 from slimsfm.arrays import IndexPairs
-from slimsfm.errors import InputError
 from slimsfm.features.base import Features
-from slimsfm.features.hdf5 import creating, groups_with, opened, read_array
-from slimsfm.files import uninterrupted
+from slimsfm.files import contents_of, uninterrupted
+from slimsfm.files.hdf5 import creating, groups_with, opened, read_array, shape_and_type
 
 _PIXEL_CENTER = np.float32(0.5)
 _INT16_MAX = np.iinfo(np.int16).max
 _TURN = 2 * np.pi + 0.01  # half floats round
+_AGAIN = "build or import the map again, or extract and match the features again"
 
 
 class FeatureFile(Mapping[str, Features]):
@@ -38,28 +39,47 @@ class FeatureFile(Mapping[str, Features]):
     HDF5 forgets how a name was spelled, so that `names` gives the spelling of the images that have one.
 
     Raises:
-        InputError: The file is missing or damaged, at construction; an entry is damaged, at access.
+        InputError: The file is missing or damaged, at construction; an entry is damaged, or its descriptors
+            have another length or type than those of other images, at access.
     """
 
     def __init__(self, path: Path, names: Iterable[str] = ()) -> None:
         self._file = opened(path)
         self._path = path
         spelled = {stored_name(name): name for name in names}
-        stored = groups_with(self._file, "keypoints")
+        with contents_of(path, "damaged", _AGAIN):
+            stored = groups_with(self._file, "keypoints")
         self._names = dict.fromkeys(sorted(spelled.get(name, name) for name in stored))
+        self._kind: tuple[int, np.dtype] | None = None  # of the descriptors of the first image that has some
 
     def __getitem__(self, name: str) -> Features:
         if name not in self._names:
             raise KeyError(name)
-        try:
-            return _read_features(self._file, name)
-        except (LookupError, OSError, TypeError, ValueError) as error:
-            raise InputError(f"{self._path}: the features of {name!r} are damaged ({error})") from error
+        with self._contents_of(name):
+            features = _read_features(self._file, name)
+            count, length = features.descriptors.shape
+            self._check_kind(count, length, features.descriptors.dtype)
+        return features
 
     def count(self, name: str) -> int:
         """Number of features of an image, without reading them."""
-        keypoints = self._file[f"{name}/keypoints"]
-        return keypoints.shape[0] if isinstance(keypoints, h5py.Dataset) and keypoints.shape else 0
+        with self._contents_of(name):
+            (length, count), kind = shape_and_type(self._file, f"{name}/descriptors")
+            self._check_kind(count, length, kind)
+            return shape_and_type(self._file, f"{name}/keypoints")[0][0]
+
+    def _contents_of(self, name: str) -> AbstractContextManager[None]:
+        return contents_of(self._path, f"the features of {name!r} are damaged", _AGAIN)
+
+    def _check_kind(self, count: int, length: int, kind: np.dtype) -> None:
+        if not count:
+            return
+        self._kind = self._kind or (length, kind)
+        if self._kind != (length, kind):
+            raise ValueError(
+                f"descriptors of {length} values of type {kind}; other images have {self._kind[0]} of type "
+                f"{self._kind[1]}"
+            )
 
     def __contains__(self, name: object) -> bool:
         return name in self._names
@@ -77,32 +97,42 @@ def stored_name(name: str) -> str:
 
 
 def _read_features(file: h5py.File, name: str) -> Features:
-    keypoints = read_array(file, f"{name}/keypoints").astype(np.float32)
+    keypoints = _read_floats(file, f"{name}/keypoints")
     if f"{name}/descriptors" not in file:
         raise ValueError("keypoints without descriptors")
-    descriptors = read_array(file, f"{name}/descriptors").T
-    scores = read_array(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
+    descriptors = _finite(read_array(file, f"{name}/descriptors"), "descriptors").T
+    scores = _read_floats(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
         raise ValueError(f"{keypoints.shape} keypoints with {descriptors.T.shape} descriptors")
-    if not len(keypoints) == len(descriptors) == len(scores):
-        raise ValueError(f"{len(keypoints)} keypoints, {len(descriptors)} descriptors, {len(scores)} scores")
+    if not (len(keypoints),) == (len(descriptors),) == scores.shape:
+        raise ValueError(f"{len(keypoints)} keypoints, {len(descriptors)} descriptors, {scores.shape} scores")
     size = read_array(file, f"{name}/image_size") if f"{name}/image_size" in file else np.zeros(2)
     return Features(
         keypoints=np.ascontiguousarray(keypoints[:, :2]) + _PIXEL_CENTER,
         descriptors=np.ascontiguousarray(descriptors),
-        scores=scores.astype(np.float32),
+        scores=np.asarray(scores, np.float32),
         image_size=(int(size[0]), int(size[1])),
         frames=_read_frames(file, name, len(keypoints)),
     )
 
 
+def _read_floats(file: h5py.File, name: str) -> Float32[np.ndarray, "..."]:
+    with np.errstate(over="ignore"):
+        return _finite(read_array(file, name).astype(np.float32), name.rpartition("/")[2])
+
+
+def _finite(values: np.ndarray, what: str) -> np.ndarray:
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        raise ValueError(f"some of its {what} are not finite")
+    return values
+
+
 def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, "n 2"] | None:
     if f"{name}/scales" not in file or f"{name}/oris" not in file:
         return None
-    frames = np.stack([read_array(file, f"{name}/{part}") for part in ("scales", "oris")], axis=1)
+    frames = np.stack([_read_floats(file, f"{name}/{part}") for part in ("scales", "oris")], axis=1)
     if frames.shape != (count, 2):
         raise ValueError(f"{count} keypoints with scales and oris of shape {frames.shape}")
-    frames = frames.astype(np.float32)
     if np.any(np.abs(frames[:, 1]) > _TURN):
         frames[:, 1] = np.radians(frames[:, 1])
     return frames
@@ -113,15 +143,24 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
 
     Each pair has one entry, named in the order of the file. `num_other_pairs` counts pairs of other images.
 
+    Args:
+        path: The file.
+        names: The images whose matches are read.
+        num_keypoints: Their numbers of keypoints; None if the caller checks that no match is beyond them.
+
     Raises:
-        InputError: The file is missing or damaged, at construction; an entry is damaged, at access.
+        InputError: The file is missing or damaged, at construction; an entry is damaged or matches keypoints
+            that its images do not have, at access.
     """
 
-    def __init__(self, path: Path, names: list[str]) -> None:
+    def __init__(
+        self, path: Path, names: Iterable[str], num_keypoints: Mapping[str, int] | None = None
+    ) -> None:
         self._file = opened(path)
-        self._path = path
+        self._path, self._num_keypoints = path, num_keypoints
         by_key = {key: name for name, key in _keys(names).items()}
-        groups = groups_with(self._file, "matches0")
+        with contents_of(path, "damaged", _AGAIN):
+            groups = groups_with(self._file, "matches0")
         pairs = ((_pair_of(group, by_key), group) for group in groups)
         found = {pair: group for pair, group in pairs if pair is not None}
         self._groups = {pair: found[pair] for pair in sorted(found)}
@@ -130,14 +169,16 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
     def __getitem__(self, pair: tuple[str, str]) -> IndexPairs:
         if pair not in self._groups:
             raise KeyError(pair)
-        try:
-            targets = read_array(self._file, f"{self._groups[pair]}/matches0").astype(np.int64)
-            if targets.ndim != 1:
-                raise ValueError(f"matches0 of shape {targets.shape}")
-        except (KeyError, OSError, TypeError, ValueError) as error:
-            raise InputError(f"{self._path}: the matches of {pair} are damaged ({error})") from error
+        with contents_of(self._path, f"the matches of {pair} are damaged", _AGAIN):
+            targets = read_array(self._file, f"{self._groups[pair]}/matches0")
+            if targets.ndim != 1 or targets.dtype.kind != "i":
+                raise ValueError(f"matches0 of shape {targets.shape} and type {targets.dtype}")
+            if self._num_keypoints:
+                a, b = (self._num_keypoints[name] for name in pair)
+                if len(targets) > a or targets.max(initial=-1) >= b:
+                    raise ValueError(f"matches beyond the {a} and {b} keypoints of its images")
         rows = np.flatnonzero(targets >= 0)
-        return np.stack([rows, targets[rows]], axis=1)
+        return np.stack([rows, targets[rows]], axis=1, dtype=np.int64)
 
     def __contains__(self, pair: object) -> bool:
         return pair in self._groups
@@ -216,8 +257,10 @@ def _keys(names: Iterable[str]) -> dict[str, str]:
 
 
 def indistinct_names(names: Iterable[str]) -> list[str]:
-    """Names of images that hloc's matches do not tell apart from another name."""
-    return [name for name, key in _keys(names).items() if key != name.replace("/", "-")]
+    """Names of images that hloc's matches do not tell apart from another one of these names, sorted."""
+    names = sorted(names)
+    counts = Counter(name.replace("/", "-") for name in names)
+    return [name for name in names if counts[name.replace("/", "-")] > 1]
 
 
 def _pair_of(group: str, by_key: Mapping[str, str]) -> tuple[str, str] | None:

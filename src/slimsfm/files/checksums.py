@@ -6,10 +6,11 @@ misses one of four thousand million others. Nobody who means to deceive is kept 
 
 import json
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from slimsfm.errors import InputError
+from slimsfm.files.names import inside
 
 COPY_AGAIN = "copy it again; if you changed it yourself, delete `checksums` from map.json"
 """What to do where a checksum differs."""
@@ -17,38 +18,46 @@ COPY_AGAIN = "copy it again; if you changed it yourself, delete `checksums` from
 _BLOCK = 1 << 20
 
 
-def checksum(path: Path) -> dict[str, Any]:
-    """Size and CRC-32 of a file."""
+@dataclass(frozen=True, kw_only=True)
+class Checksum:
+    """What a file is checked by."""
+
+    bytes: int | None = None
+    """Its size."""
+
+    crc32: str
+    """CRC-32 of its contents, eight hexadecimal digits."""
+
+
+def checksum(path: Path) -> Checksum:
+    """The checksum of a file."""
     value, size = 0, 0
     with path.open("rb", buffering=0) as file:
         while block := file.read(_BLOCK):
             value, size = zlib.crc32(block, value), size + len(block)
-    return {"bytes": size, "crc32": f"{value:08x}"}
+    return Checksum(bytes=size, crc32=f"{value:08x}")
 
 
-def checksums_of(folder: Path) -> dict[str, dict[str, Any]]:
+def checksums_of(folder: Path) -> dict[str, Checksum]:
     """Checksums of all files in a folder and its subfolders, by path within it."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): checksum(path) for path in files}
 
 
-def check_files(folder: Path, stored: dict[str, dict[str, Any]]) -> None:
+def check_files(folder: Path, stored: dict[str, Checksum]) -> None:
     """Check files of a folder by their checksums; files that have none are not checked.
 
     Raises:
-        InputError: A file is missing or has other contents.
+        InputError: A file is missing or has other contents, or a path leads out of the folder.
     """
     for name, expected in stored.items():
-        path = folder / name
-        try:
-            found = checksum(path)
-        except FileNotFoundError as error:
-            raise InputError(f"{path}: missing; {COPY_AGAIN}") from error
-        if found["bytes"] != expected["bytes"]:
-            raise InputError(
-                f"{path}: damaged: {found['bytes']} bytes instead of {expected['bytes']}; {COPY_AGAIN}"
-            )
-        if found["crc32"] != expected["crc32"]:
+        path = inside(folder, name)
+        if not path.is_file():
+            raise InputError(f"{path}: missing; {COPY_AGAIN}")
+        found = checksum(path)
+        if found.bytes != expected.bytes:
+            raise InputError(f"{path}: damaged: {found.bytes} bytes, not {expected.bytes}; {COPY_AGAIN}")
+        if found.crc32 != expected.crc32:
             raise InputError(f"{path}: damaged: its contents do not have the stored checksum; {COPY_AGAIN}")
 
 

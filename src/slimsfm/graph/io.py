@@ -10,23 +10,21 @@ at the end is the result of a crash and is removed.
 """
 
 import csv
-import zlib
+from collections.abc import Mapping
 from contextlib import suppress
+from io import StringIO
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array
 
 from slimsfm.errors import InputError, OutputError
-from slimsfm.files import replacing
+from slimsfm.files import contents_of, read_npz, read_text, replacing
 from slimsfm.graph.reference_graph import GraphRun, ReferenceGraph
 from slimsfm.mapping.map import Map
-
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, BadZipFile, zlib.error)
 
 _RECORD = np.dtype([("u", "<u4"), ("v", "<u4"), ("v_from_u", "<f8"), ("u_from_v", "<f8")])
 
@@ -117,7 +115,8 @@ def read_kept_graph(path: Path, key: str, start: float) -> GraphRun | None:
         start: When the caller started, by `perf_counter`: the time until now is reported as that of reading.
     """
     try:
-        with path.open("rb") as file, np.load(file) as stored:
+        with contents_of(path, "damaged"):
+            stored = read_npz(path)
             if str(stored["key"]) != key:
                 return None
             return GraphRun(
@@ -125,11 +124,11 @@ def read_kept_graph(path: Path, key: str, start: float) -> GraphRun | None:
                 pairs_tried=int(stored["pairs_tried"]),
                 seconds={"read": perf_counter() - start},
             )
-    except _UNREADABLE:
+    except InputError:
         return None
 
 
-def _from_npz(stored: np.lib.npyio.NpzFile) -> ReferenceGraph:
+def _from_npz(stored: Mapping[str, np.ndarray]) -> ReferenceGraph:
     names = tuple(stored["names"].tolist())
     shape = (len(names), len(names))
     errors = csr_array((stored["data"], stored["indices"], stored["indptr"]), shape=shape)
@@ -154,11 +153,8 @@ def read_given_graph(path: str | Path, map: Map) -> ReferenceGraph:
     path = Path(path)
     if path.suffix == ".csv":
         return _read_csv(path, map)
-    try:
-        with path.open("rb") as file, np.load(file) as stored:
-            graph = _from_npz(stored)
-    except _UNREADABLE as error:
-        raise InputError(f"{path}: not a readable graph, neither .csv nor .npz ({error})") from error
+    with contents_of(path, "not a readable graph, neither .csv nor .npz"):
+        graph = _from_npz(read_npz(path))
     if graph.names != tuple(map.images):
         raise InputError(f"{path}: the images of the graph are not those of the map")
     return graph
@@ -167,18 +163,15 @@ def read_given_graph(path: str | Path, map: Map) -> ReferenceGraph:
 def _read_csv(path: Path, map: Map) -> ReferenceGraph:
     index = {name: number for number, name in enumerate(map.images)}
     pairs, errors = [], []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file)
-            if not {"reference", "query", "error"} <= set(rows.fieldnames or ()):
-                raise InputError(f"{path}: lacks one of the columns reference, query, error")
-            for row in rows:
-                pairs.append((index[row["reference"]], index[row["query"]]))
-                errors.append(float(row["error"]))
+    with contents_of(path, "not a readable table of errors"):
+        rows = csv.DictReader(StringIO(read_text(path), newline=""))
+        if not {"reference", "query", "error"} <= set(rows.fieldnames or ()):
+            raise InputError(f"{path}: lacks one of the columns reference, query, error")
+        for row in rows:
+            if unknown := {row["reference"], row["query"]} - index.keys():
+                raise InputError(f"{path}: {unknown.pop()!r} is not an image of the map")
+            pairs.append((index[row["reference"]], index[row["query"]]))
+            errors.append(float(row["error"]))
         return ReferenceGraph.from_errors(
             tuple(map.images), np.array(pairs, np.int64).reshape(-1, 2), np.array(errors, np.float64)
         )
-    except KeyError as error:
-        raise InputError(f"{path}: {error} is not an image of the map") from error
-    except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: not a readable table of errors ({error})") from error

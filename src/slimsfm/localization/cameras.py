@@ -1,6 +1,5 @@
 """What is known about a query image in advance: its intrinsics, and the direction of gravity."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -11,6 +10,7 @@ from jaxtyping import Float64
 
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import Exif, read_exif
+from slimsfm.files import contents_of, plain, read_json, read_text
 from slimsfm.lenses import camera_fault
 from slimsfm.localization.map_cameras import camera_by_exif, camera_of_size, scaled_camera, zoomed_camera
 from slimsfm.mapping.map import Map
@@ -60,10 +60,8 @@ def read_camera(path: str | Path) -> pycolmap.Camera:
         InputError: The file is missing, does not hold exactly one camera, or an impossible one.
     """
     path = Path(path)
-    try:
-        lines = [line.split() for line in path.read_text("utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a readable camera file ({error})") from error
+    with contents_of(path, "not a readable camera file"):
+        lines = [line.split() for line in read_text(path).splitlines()]
     cameras = [words for words in lines if words and not words[0].startswith("#")]
     try:
         (camera,) = cameras
@@ -211,15 +209,11 @@ def read_gravity(path: str | Path) -> dict[str, Gravity]:
         InputError: The file is missing or has other contents.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text("utf-8-sig"))
+    with contents_of(path, 'should hold {"world": [x, y, z], "images": {NAME: [x, y, z], ...}}'):
+        data = read_json(path)
         world = _vector(data["world"])
         return {str(name): Gravity(in_world=world, in_cam=_vector(v)) for name, v in data["images"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f'{path}: should hold {{"world": [x, y, z], "images": {{NAME: [x, y, z], ...}}}} ({error})'
-        ) from error
 
 
 def _vector(values: object) -> Float64[np.ndarray, "3"]:
-    return np.array(values, np.float64).reshape(3)
+    return np.array(plain(values, list[float]), np.float64).reshape(3)

@@ -9,7 +9,7 @@ import pycolmap
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import MapError
-from slimsfm.features import Features, load_extractor, shrink_factor, unit_rows
+from slimsfm.features import Features, shrink_factor, unit_rows
 from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import (
     FocalLength,
@@ -21,6 +21,7 @@ from slimsfm.localization.outcome import Localization, Seconds
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.descriptors import descriptor_length
+from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 from slimsfm.pose import Gravity, RansacOptions
 
@@ -115,7 +116,7 @@ class Localizer:
     def __init__(self, map: Map, options: LocalizationOptions = LocalizationOptions()) -> None:
         self.map = map
         self.options = options
-        self.extractor = load_extractor(map.info.extractor, map.info.extractor_options)
+        self.extractor = extractor_of(map)
         self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
         self._length = descriptor_length(map)
         self._search = Search(map, self._strategy, options.ransac, options.focal)

@@ -16,7 +16,6 @@ from slimsfm.features import (
     Features,
     Matcher,
     NearestOptions,
-    load_extractor,
     load_matcher,
     match_nearest,
     shrink_factor,
@@ -24,6 +23,7 @@ from slimsfm.features import (
 )
 from slimsfm.geometry import Box, project
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target
+from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 
 
@@ -76,7 +76,7 @@ def matching_with(map: Map, options: MatchingOptions, cached: int | None = None)
     """
     extractor = map.info.extractor
     if not map.has_keypoints and options.matcher in ("auto", extractor):
-        made = load_extractor(extractor, map.info.extractor_options)
+        made = extractor_of(map)
         if isinstance(made, WholeImageExtractor):
             return made.reference_matching(map)
         raise InputError(f"extractor {extractor!r} finds no keypoints and has no `reference_matching`")

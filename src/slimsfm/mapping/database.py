@@ -27,7 +27,7 @@ from jaxtyping import Float32
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError, ModelError
 from slimsfm.features import Features
-from slimsfm.files import working_folder
+from slimsfm.files import contents_of, plain, working_folder
 
 _MAGIC = b"SQLite format 3\0"
 _JOURNALS = ("-wal", "-journal")  # with what is not yet in the database itself
@@ -55,11 +55,9 @@ def read_database(path: Path, names: Iterable[str]) -> DatabaseContents:
         InputError: The file is missing, damaged or no COLMAP database.
         ModelError: Keypoints have no descriptors, or descriptors are of several extractors.
     """
-    try:
-        with _opened(path) as database:
-            return _read(path, database, set(names))
-    except (sqlite3.Error, OSError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not readable as a COLMAP database ({error})") from error
+    with contents_of(path, "not readable as a COLMAP database"), _opened(path) as database:
+        _check_tables(database)
+        return _read(path, database, set(names))
 
 
 @contextmanager
@@ -80,11 +78,23 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             yield database
 
 
+def _check_tables(database: sqlite3.Connection) -> None:
+    """Check that tables hold what is read: SQL in a file, as of a view, may compute anything for any time."""
+    schema = "SELECT name, type, rootpage FROM sqlite_master WHERE type NOT IN ('index', 'trigger')"
+    for name, kind, page in database.execute(schema).fetchall():
+        columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (name,)) if page else ()
+        if kind != "table" or not page or any(hidden for (hidden,) in columns):
+            raise ValueError(f"{name!r} is not a plain table")
+
+
 def _read(path: Path, database: sqlite3.Connection, names: set[str]) -> DatabaseContents:
     found = database.execute(
         "SELECT image_id, name, width, height FROM images LEFT JOIN cameras USING (camera_id)"
     )
-    images = {image_id: (name, (width or 0, height or 0)) for image_id, name, width, height in found}
+    images = {
+        image_id: (name, (plain(width or 0, int), plain(height or 0, int)))
+        for image_id, name, width, height in found
+    }
     images = {image_id: one for image_id, one in images.items() if one[0] in names}
     features, extractors = {}, set()
     for image_id, (name, size) in images.items():
@@ -99,9 +109,12 @@ def _read(path: Path, database: sqlite3.Connection, names: set[str]) -> Database
                 "extract its features again, or give another source of descriptors"
             )
         is_sift = extractor in _SIFT
+        descriptors = descriptors if is_sift else descriptors.view(np.float32)
+        if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
+            raise ValueError(f"features of image {name!r} that are not finite")
         features[name] = Features(
             keypoints=np.ascontiguousarray(keypoints[:, :2]),
-            descriptors=descriptors if is_sift else descriptors.view(np.float32),
+            descriptors=descriptors,
             scores=np.ones(len(keypoints), np.float32),
             image_size=size,
             frames=_frames(keypoints) if is_sift else None,
@@ -123,7 +136,9 @@ def _array(database: sqlite3.Connection, table: str, image_id: int, kind: type) 
 def _matrix(row: tuple[int, int, bytes | None], kind: type) -> np.ndarray:
     rows, columns, data = row
     if not rows:
-        return np.zeros((0, max(columns, 2)), kind)
+        return np.zeros((0, 2), kind)
+    if plain(rows, int) < 0 or plain(columns, int) < 1 + (kind is not np.uint8):
+        raise ValueError(f"a matrix of {rows} rows and {columns} columns")
     return np.frombuffer(data or b"", kind).reshape(rows, columns).copy()
 
 
@@ -155,7 +170,7 @@ def _matches(database: sqlite3.Connection, names: dict[int, str]) -> dict[tuple[
         one, other = pycolmap.pair_id_to_image_pair(pair_id)
         if one not in names or other not in names:
             continue
-        pairs = _matrix(tuple(row), np.uint32).astype(np.int64)
+        pairs = _matrix(tuple(row), np.uint32)[:, :2].astype(np.int64)
         ordered = names[one] < names[other]
         pairs = pairs if ordered else pairs[:, ::-1]
         key = (names[one], names[other]) if ordered else (names[other], names[one])

@@ -5,31 +5,25 @@ table, which is larger than the descriptors of a few hundred points.
 """
 
 import lzma
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from slimsfm.arrays import Descriptors, Mask
-from slimsfm.errors import InputError
+from slimsfm.errors import MapError
 from slimsfm.features import unit_rows
 from slimsfm.features.nearest import learn_words, vlad
+from slimsfm.files import contents_of, read_npz, unpacked
+from slimsfm.limits import check_bytes
 from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors
 
 _LEVELS = 15
 _SAMPLE = 500  # descriptors per image that the vocabulary is learned from
 _INT8_MAX = np.iinfo(np.int8).max
-UNREADABLE = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError),
-    *(BadZipFile, RuntimeError, zlib.error, lzma.LZMAError),  # raised by zip files and their parts
-)
-"""Exceptions that reading a damaged file of arrays may raise."""
-
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes lack context
 
 
@@ -82,13 +76,16 @@ def unpack(arrays: Mapping[str, np.ndarray], count: int) -> Descriptors:
     """Restore `count` rows from the arrays of `pack`.
 
     Raises:
-        ValueError: The arrays hold another number of rows. Damaged arrays raise any of `UNREADABLE`.
+        ValueError: The arrays hold another number of rows. Damaged arrays raise other errors as well.
+        InputError: The rows are larger than the limit.
     """
-    codes = np.frombuffer(lzma.decompress(arrays["codes"].tobytes()), np.uint8)
     (low, high), dimensions = arrays["range"].tolist(), int(arrays["dimensions"])
-    return Quantized(
-        codes=codes.reshape(count, (dimensions + 1) // 2), dimensions=dimensions, low=low, high=high
-    ).restore()
+    if not (dimensions > 0 and np.isfinite(low) and np.isfinite(high)):
+        raise ValueError(f"{dimensions} values from {low} to {high} are no descriptors")
+    width = (dimensions + 1) // 2
+    check_bytes(f"{count} descriptors of {dimensions} values", count * dimensions * np.float32().nbytes)
+    codes = np.frombuffer(unpacked(arrays["codes"].tobytes(), count * width), np.uint8)
+    return Quantized(codes=codes.reshape(count, width), dimensions=dimensions, low=low, high=high).restore()
 
 
 def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
@@ -110,39 +107,55 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
     Raises:
         InputError: The file is damaged, or belongs to another model.
     """
-    try:
-        with path.open("rb") as opened, np.load(opened) as file:
-            steps = np.frombuffer(lzma.decompress(file["points"].tobytes()), np.uint32)
-            points = np.cumsum(steps, dtype=np.int64) - 1
-            if not len(points) or points[-1] >= num_points or not steps.all():
-                raise ValueError(f"its rows do not belong to {num_points} points")
-            return PointDescriptors(
-                points=points,
-                descriptors=unpack(file, len(points)),
-                directions=_unpack_directions(file, len(points)) if "directions" in file else None,
-                distinct=_unpack_bits(file["distinct"], len(points)) if "distinct" in file else None,
-            )
-    except UNREADABLE as error:
-        raise InputError(f"{path}: damaged ({error}); reduce the full map again") from error
+    with contents_of(path, "damaged", "reduce the full map again"):
+        arrays = read_npz(path)
+        most = num_points * np.uint32().nbytes
+        steps = np.frombuffer(unpacked(arrays["points"].tobytes(), most), np.uint32)
+        points = np.cumsum(steps, dtype=np.int64) - 1
+        if not len(points) or points[-1] >= num_points or not steps.all():
+            raise ValueError(f"its rows do not belong to {num_points} points")
+        return PointDescriptors(
+            points=points,
+            descriptors=unpack(arrays, len(points)),
+            directions=_unpack_directions(arrays, len(points)) if "directions" in arrays else None,
+            distinct=_unpack_bits(arrays["distinct"], len(points)) if "distinct" in arrays else None,
+        )
 
 
 def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[np.ndarray, "n 3"]:
-    return arrays["directions"].reshape(count, 3).astype(np.float32) / _INT8_MAX
+    stored = arrays["directions"]
+    if stored.shape != (count, 3) or stored.dtype != np.int8:
+        raise ValueError(f"directions of shape {stored.shape} and type {stored.dtype} for {count} points")
+    return stored.astype(np.float32) / _INT8_MAX
 
 
 def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:
-    if len(packed) != (count + 7) // 8:
-        raise ValueError(f"{len(packed)} bytes do not hold one bit per point for {count} points")
+    if packed.dtype != np.uint8 or packed.shape != ((count + 7) // 8,):
+        raise ValueError(
+            f"an array of shape {packed.shape} does not hold one bit per point for {count} points"
+        )
     return np.unpackbits(packed, count=count).astype(bool)
 
 
 def descriptor_length(map: Map) -> int | None:
-    """Number of values of the map's descriptors; None if images are matched as a whole."""
+    """Number of values of the map's descriptors; None if images are matched as a whole.
+
+    Raises:
+        MapError: The descriptors of its points, images and vocabulary differ in length.
+    """
     if not map.has_keypoints:
         return None
+    of_images = (one.shape[1] for name in map.features if len(one := map.features[name].descriptors))
+    lengths = [next(of_images, None)]
     if map.point_descriptors is not None:
-        return map.point_descriptors.descriptors.shape[1]
-    return next((one.shape[1] for name in map.images if len(one := map.features[name].descriptors)), None)
+        lengths.append(map.point_descriptors.descriptors.shape[1])
+    if map.global_descriptors is not None:
+        lengths.append(map.global_descriptors.vocabulary.shape[1])
+    known = sorted({length for length in lengths if length is not None})
+    if len(known) > 1:
+        counts = " and of ".join(str(one) for one in known)
+        raise MapError(f"the map has descriptors of {counts} values; build or import it again")
+    return known[0] if known else None
 
 
 def with_global_descriptors(map: Map) -> Map:
@@ -181,11 +194,9 @@ def read_global_descriptors(path: Path, num_images: int) -> GlobalDescriptors:
     Raises:
         InputError: The file is damaged, or belongs to another map.
     """
-    try:
-        with path.open("rb") as opened, np.load(opened) as file:
-            words, rows = file["words"].astype(np.float32), unpack(file, num_images)
-        if words.ndim != 2 or rows.shape[1] != words.size:
+    with contents_of(path, "damaged", "build or import the map again"):
+        arrays = read_npz(path)
+        words, rows = arrays["words"].astype(np.float32), unpack(arrays, num_images)
+        if words.ndim != 2 or not words.size or rows.shape[1] != words.size or not np.isfinite(words).all():
             raise ValueError(f"rows of {rows.shape[1]} values do not match words of shape {words.shape}")
         return GlobalDescriptors(vocabulary=words, descriptors=rows)
-    except UNREADABLE as error:
-        raise InputError(f"{path}: damaged ({error}); build or import the map again") from error

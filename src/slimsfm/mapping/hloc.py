@@ -23,7 +23,7 @@ import pycolmap
 from slimsfm.errors import InputError, MapError
 from slimsfm.features import Features, unit_rows
 from slimsfm.features.store import FeatureWriter, indistinct_names, write_matches
-from slimsfm.files import replacing
+from slimsfm.files import contents_of, read_text, replacing
 from slimsfm.image_files import list_images
 from slimsfm.mapping.map import Map, check_num_features
 from slimsfm.mapping.orientation import stored_model, turned_features, turns_to_stored
@@ -81,10 +81,8 @@ def read_query_names(path: str | Path) -> list[str]:
     path = Path(path)
     if path.is_dir():
         return list_images(path)
-    try:
-        lines = path.read_text("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: neither a folder of images nor a readable list of names") from error
+    with contents_of(path, "neither a folder of images nor a readable list of names"):
+        lines = read_text(path).splitlines()
     names = [_name(line, path) for line in lines if line.strip() and not line.startswith("#")]
     if not names:
         raise InputError(f"{path}: holds no name of a query")

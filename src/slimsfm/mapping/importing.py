@@ -11,6 +11,7 @@ from slimsfm.errors import ModelError
 from slimsfm.exif import read_device, read_orientation
 from slimsfm.features import Features
 from slimsfm.features.store import stored_name
+from slimsfm.files import inside
 from slimsfm.mapping.agreement import Masks, counted, place_features
 from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
@@ -146,7 +147,7 @@ def _quality(model: pycolmap.Reconstruction, matches: Matches) -> ModelQuality:
 def _tags(images: list[pycolmap.Image], options: ImportOptions) -> dict[str, int]:
     if options.orientation == "stored" or options.images is None:
         return {}
-    tags = {image.name: read_orientation(options.images / image.name) for image in images}
+    tags = {image.name: read_orientation(inside(options.images, image.name)) for image in images}
     return {name: tag for name, tag in tags.items() if tag != 1}
 
 
@@ -156,7 +157,7 @@ def _devices(
     if options.images is None:
         return {}
     names = [image.name for image in images]
-    return devices_by_camera(model, {name: read_device(options.images / name) for name in names})
+    return devices_by_camera(model, {name: read_device(inside(options.images, name)) for name in names})
 
 
 def _find_source(

@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from slimsfm.devices import Device
+from slimsfm.files import plain
 from slimsfm.geometry import Box
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation
@@ -11,7 +13,11 @@ from slimsfm.photos import Orientation
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapInfo:
-    """Metadata of a map, stored in its `map.json`."""
+    """Metadata of a map, stored in its `map.json`.
+
+    Raises:
+        ValueError: A text is none, or the options of the extractor are no options.
+    """
 
     extractor: str
     """Name of the extractor of the map's features and of the queries'."""
@@ -47,3 +53,10 @@ class MapInfo:
     devices: Mapping[int, Device] = field(default_factory=dict)
     """What EXIF says of the photos that a camera was made with, by its id, where they agree. Empty in older
     maps and in maps made without the photos."""
+
+    def __post_init__(self) -> None:
+        for name in ("extractor", "box_source", "unit", "origin"):
+            plain(getattr(self, name), str)
+        largest = plain(self.extractor_options, dict[str, Any]).get("max_image_size")
+        if plain(largest, float | None) is not None and largest < 1:
+            raise ValueError(f"max_image_size must be at least 1, got {largest}")

@@ -3,14 +3,15 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from slimsfm.devices import Device
-from slimsfm.errors import MapError
-from slimsfm.files.checksums import COPY_AGAIN, checksum_of_json, checksums_of
+from slimsfm.errors import InputError, MapError
+from slimsfm.files import contents_of, plain, read_json
+from slimsfm.files.checksums import COPY_AGAIN, Checksum, checksum_of_json, checksums_of
 from slimsfm.geometry import Box
 from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.map import Map
@@ -29,15 +30,15 @@ class StoredInfo(NamedTuple):
     info: MapInfo
     """What the map says of itself."""
 
-    checksums: dict[str, dict[str, Any]]
-    """Size and CRC-32 of the other files, by path within the map; empty in older maps."""
+    checksums: dict[str, Checksum]
+    """Checksums of the other files, by path within the map; empty in older maps."""
 
 
 def write_info(map: Map, folder: Path) -> None:
     """Write the map.json of a map whose other files are in a folder already."""
-    data = _info_to_json(map)
-    checksums = checksums_of(folder)
-    data["checksums"] = {**checksums, _NAME: {"crc32": checksum_of_json({**data, "checksums": checksums})}}
+    checksums = {name: asdict(one) for name, one in checksums_of(folder).items()}
+    data = {**_info_to_json(map), "checksums": checksums}
+    checksums[_NAME] = {"crc32": _own_checksum(data)}
     (folder / _NAME).write_text(json.dumps(data, indent=2) + "\n")
 
 
@@ -64,27 +65,6 @@ def _info_to_json(map: Map) -> dict:
     }
 
 
-def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
-    return np.array(values, np.float64).reshape(shape)
-
-
-def _device(data: dict) -> Device:
-    return Device(
-        make=str(data["make"]),
-        model=str(data["model"]),
-        focal_mm=float(data["focal_mm"]),
-        focal_35mm=float(data["focal_35mm"]),
-        digital_zoom=float(data["digital_zoom"]),
-    )
-
-
-def _orientation(value: object) -> Orientation:
-    for known in get_args(Orientation):
-        if value == known:
-            return known
-    raise ValueError(f"orientation must be one of {', '.join(get_args(Orientation))}, got {value!r}")
-
-
 def read_info(path: Path) -> StoredInfo:
     """Read the map.json in the folder of a map, and check it by its own checksum.
 
@@ -92,32 +72,40 @@ def read_info(path: Path) -> StoredInfo:
         MapError: The folder has none, or it is damaged or of a later version.
     """
     file = path / _NAME
+    if not file.is_file():
+        raise MapError(f"{path}: not a map (it has no map.json); build or import one")
     try:
-        data = json.loads(file.read_text())
-        version = data["format_version"]
-        if version > FORMAT_VERSION:
-            raise MapError(
-                f"{path}: the map has format {version}, but this slimsfm reads only formats up to "
-                f"{FORMAT_VERSION}; upgrade slimsfm"
-            )
-        stored = StoredInfo(_info_from_json(data), dict(data.get("checksums", {})))
-        is_whole = not stored.checksums or _has_its_checksum(data, stored.checksums)
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise MapError(f"{path}: not a map (it has no map.json); build or import one") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise MapError(f"{file}: damaged ({error}); build or import the map again") from error
-    if not is_whole:
-        raise MapError(f"{file}: damaged: its contents do not have the stored checksum; {COPY_AGAIN}")
-    return stored
+        with contents_of(file, "damaged", "build or import the map again"):
+            data = read_json(file)
+            _check_version(data["format_version"], path)
+            info = _info_from_json(data)
+            checksums = plain(data.get("checksums", {}), dict[str, Checksum])
+            own = checksums.pop(_NAME).crc32 if checksums else ""
+        if own and own != _own_checksum(data):
+            raise MapError(f"{file}: damaged: its contents do not have the stored checksum; {COPY_AGAIN}")
+    except MapError:
+        raise
+    except InputError as error:
+        raise MapError(str(error)) from error
+    return StoredInfo(info, checksums)
 
 
-def _has_its_checksum(data: dict[str, Any], checksums: dict[str, dict[str, Any]]) -> bool:
-    """Whether a map.json is as it was written; takes its own checksum out of `checksums`."""
-    expected = checksums.pop(_NAME)["crc32"]
-    return checksum_of_json({**data, "checksums": checksums}) == expected
+def _check_version(version: int, path: Path) -> None:
+    if version > FORMAT_VERSION:
+        raise MapError(
+            f"{path}: the map has format {version}, but this slimsfm reads only formats up to "
+            f"{FORMAT_VERSION}; upgrade slimsfm"
+        )
+
+
+def _own_checksum(data: dict[str, Any]) -> str:
+    """The checksum of a map.json, of all that it holds but the checksum itself."""
+    others = {name: one for name, one in data.get("checksums", {}).items() if name != _NAME}
+    return checksum_of_json({**data, "checksums": others})
 
 
 def _info_from_json(data: dict[str, Any]) -> MapInfo:
+    devices = plain(data.get("devices", {}), dict[str, Device])
     return MapInfo(
         extractor=data["extractor"]["name"],
         extractor_options=data["extractor"]["options"],
@@ -125,9 +113,13 @@ def _info_from_json(data: dict[str, Any]) -> MapInfo:
         box_source=data["box"]["source"],
         unit=data["unit"],
         origin=data["origin"],
-        notes=tuple(map(str, data.get("notes", ()))),
+        notes=plain(data.get("notes", ()), tuple[str, ...]),
         quality=quality_from_json(data.get("quality")),
-        orientation=_orientation(data.get("orientation", "upright")),
-        exif_orientations={str(name): int(tag) for name, tag in data.get("exif_orientations", {}).items()},
-        devices={int(key): _device(device) for key, device in data.get("devices", {}).items()},
+        orientation=plain(data.get("orientation", "upright"), Orientation),
+        exif_orientations=plain(data.get("exif_orientations", {}), dict[str, int]),
+        devices={int(key): device for key, device in devices.items()},
     )
+
+
+def _numbers(values: list, *shape: int) -> Float64[np.ndarray, "..."]:
+    return np.array(values, np.float64).reshape(shape)

@@ -14,16 +14,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import cv2
-import h5py
 import numpy as np
 from jaxtyping import UInt8
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, MapError
-from slimsfm.features.hdf5 import creating, opened, read_array
 from slimsfm.features.store import FeatureFile, FeatureWriter, MatchFile, write_matches
-from slimsfm.files import read_unchanged, replacing, uninterrupted, working_folder
+from slimsfm.files import contents_of, read_unchanged, replacing, uninterrupted, working_folder
 from slimsfm.files.checksums import check_files
+from slimsfm.files.hdf5 import creating, datasets_of, opened, read_array
 from slimsfm.mapping.descriptors import (
     read_global_descriptors,
     read_point_descriptors,
@@ -32,10 +31,11 @@ from slimsfm.mapping.descriptors import (
 )
 from slimsfm.mapping.info_file import read_info, write_info
 from slimsfm.mapping.map import Map, check_map, check_num_features
-from slimsfm.mapping.model import read_model
-from slimsfm.photos import shrink
+from slimsfm.mapping.model import num_keypoints, read_model
+from slimsfm.photos import decode_jpeg, shrink
 
 _QUALITY = 95
+_AGAIN = "build the map again"
 _PARTS = "features.h5", "matches.h5", "photos.h5", "global.npz", "points.npz"
 
 
@@ -48,22 +48,15 @@ class PhotoFile(Mapping[str, Image]):
 
     def __init__(self, path: Path) -> None:
         self._file, self._path = opened(path), path
-        found: list[str] = []
-        self._file.visititems(
-            lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None
-        )
-        self._names = dict.fromkeys(sorted(found))
+        with contents_of(path, "damaged", _AGAIN):
+            self._names = dict.fromkeys(sorted(datasets_of(self._file)))
 
     def __getitem__(self, name: str) -> Image:
         if name not in self._names:
             raise KeyError(name)
-        try:
-            photo = cv2.imdecode(np.asarray(read_array(self._file, name), np.uint8), cv2.IMREAD_COLOR_RGB)
-        except (cv2.error, OSError, TypeError, ValueError) as error:
-            raise InputError(f"{self._path}: the photo of {name!r} is damaged ({error})") from error
-        if photo is None:
-            raise InputError(f"{self._path}: the photo of {name!r} is damaged")
-        return np.asarray(photo, np.uint8)
+        what = f"the photo of {name!r}"
+        with contents_of(self._path, f"{what} is damaged", _AGAIN):
+            return decode_jpeg(read_array(self._file, name), f"{self._path}: {what}")
 
     def __contains__(self, name: object) -> bool:
         return name in self._names
@@ -117,7 +110,7 @@ def _read_map(path: Path) -> Map:
     map_ = Map(
         model=model,
         features={} if direct and "features" not in parts else FeatureFile(path / "features.h5", names),
-        matches=MatchFile(parts["matches"], names) if "matches" in parts else {},
+        matches=MatchFile(parts["matches"], names, num_keypoints(model)) if "matches" in parts else {},
         point_descriptors=read_point_descriptors(direct, model.num_points3D()) if direct else None,
         global_descriptors=read_global_descriptors(everywhere, len(names)) if everywhere else None,
         photos=PhotoFile(photos) if photos else {},

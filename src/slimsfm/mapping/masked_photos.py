@@ -15,6 +15,7 @@ from typing import Literal
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import ImageError, InputError
+from slimsfm.files import inside
 from slimsfm.image_files import FoundImages, find_images, named
 from slimsfm.photos import Orientation, Photo, as_stored, read_photo, read_stored_mask, upright
 
@@ -80,7 +81,7 @@ class MaskedPhotos:
         Raises:
             ImageError: The photo or its mask is unreadable, or they differ in size.
         """
-        photo = read_photo(self._folder / name, self._orientation, warn=False)
+        photo = read_photo(inside(self._folder, name), self._orientation, warn=False)
         if photo.num_frames > 1:
             self._said[name]["photo(s) of several frames or pages, of which the first is used"] = name
         try:

@@ -4,7 +4,6 @@ Damage that pycolmap does not notice is searched for in its bytes (`mapping.bina
 returns.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,8 @@ import pycolmap
 from jaxtyping import Float64
 
 from slimsfm.arrays import Ids, Points2D, Points3D
-from slimsfm.errors import InputError, ModelError
+from slimsfm.errors import ModelError
+from slimsfm.files import contents_of, read_json, read_text
 from slimsfm.geometry import Box
 from slimsfm.lenses import camera_fault
 from slimsfm.mapping.binary import MODEL_PARTS, check_binary
@@ -107,6 +107,12 @@ def _num_track_elements(model: pycolmap.Reconstruction) -> int:
     return sum(point.track.length() for point in model.points3D.values())
 
 
+def num_keypoints(model: pycolmap.Reconstruction) -> dict[str, int]:
+    """The number of keypoints of each image of a model that has a pose, by name."""
+    images = (model.image(image_id) for image_id in model.reg_image_ids())
+    return {image.name: image.num_points2D() for image in images}
+
+
 def positions(image: pycolmap.Image) -> Points2D:
     """The keypoints of an image of a model."""
     return np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
@@ -140,20 +146,14 @@ def read_box(path: str | Path) -> Box:
         InputError: The file is missing, or does not hold the 8 corners of a box.
     """
     path = Path(path)
-    try:
+    with contents_of(path, "must hold the 8 corners of a box, each a line or list of x y z"):
         if path.suffix.lower() == ".json":
-            data = json.loads(path.read_text("utf-8-sig"))
+            data = read_json(path)
             corners = np.array(data["corners"] if isinstance(data, dict) else data, np.float64)
         else:
-            lines = [line.split() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
+            lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
             corners = np.array(lines, np.float64)
         return Box.from_corners(corners)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such box file") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: must hold the 8 corners of a box, each a line or list of x y z ({error})"
-        ) from error
 
 
 def estimate_box(model: pycolmap.Reconstruction) -> Box:

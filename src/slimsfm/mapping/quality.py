@@ -1,7 +1,9 @@
 """The quality of a model: what supports it, and what contradicts it."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
+
+from slimsfm.files import plain
 
 MIN_COMMON_POINTS = 15
 """Points that two images must both see to be joined."""
@@ -131,13 +133,9 @@ def quality_from_json(data: dict[str, Any] | None) -> ModelQuality | None:
     """A quality from the plain values that `dataclasses.asdict` gives; None stays None.
 
     Raises:
-        KeyError, TypeError: A value is missing.
+        KeyError, ValueError: A value is missing or of another type.
     """
-    if data is None:
-        return None
-    lists = {key: tuple(data[key]) for key in ("doubtful", "pieces")}
-    known = {field.name for field in fields(ModelQuality)}  # later versions may store more
-    return ModelQuality(**{key: value for key, value in {**data, **lists}.items() if key in known})
+    return plain(data, ModelQuality | None)
 
 
 def turned(share: float) -> str:

@@ -17,6 +17,7 @@ from slimsfm.errors import ImageError, ModelError
 from slimsfm.exif import read_orientation
 from slimsfm.features import Features
 from slimsfm.features.sift import Sift, root_sift
+from slimsfm.files import inside
 from slimsfm.mapping.agreement import counted
 from slimsfm.mapping.model import camera_of, positions
 from slimsfm.photos import Orientation, read_image
@@ -50,7 +51,7 @@ def redescribe(
     extractor, features, scales = Sift(), {}, (0.0, np.inf)
     skipped = SkippedPhotos(folder)
     for image in progress(images, "describe keypoints"):
-        path, camera, pixels = folder / image.name, camera_of(image), None
+        path, camera, pixels = inside(folder, image.name), camera_of(image), None
         with skipped.skipping(image.name):
             pixels = read_image(path, orientation)
         if pixels is None:

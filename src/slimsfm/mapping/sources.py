@@ -113,7 +113,7 @@ def from_hloc(images: list[pycolmap.Image], path: Path, matches: Path | None, ex
     _check_present(images, features, path)
     found, notes = {}, ()
     if matches:
-        if indistinct := indistinct_names(features):
+        if indistinct := [name for name in indistinct_names(stored) if name in features]:
             raise InputError(
                 f"{matches}: cannot tell {counted(indistinct)} from names that have - instead of /; "
                 "leave `matches` out"

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from slimsfm.files import working_folder
+from slimsfm.files import read_bytes, read_text, working_folder
 from slimsfm.mapping.binary import MODEL_PARTS
 
 _NO_NUMBER = re.compile(r"[-+]?(nan|inf(inity)?)(?=\s|$)", re.IGNORECASE)
@@ -22,7 +22,7 @@ _FAR = 1e30  # stands in for what is not a number
 def read_text_model(path: Path) -> pycolmap.Reconstruction:
     """Read a text model; a damaged one raises any of pycolmap's errors, or ValueError."""
     files = [file for part in MODEL_PARTS if (file := path / f"{part}.txt").is_file()]
-    lines = (path / "images.txt").read_text("utf-8-sig").split("\n")
+    lines = read_text(path / "images.txt").split("\n")
     odd = {row for row in _keypoint_rows(lines) if "n" in "".join(lines[row : row + 1]).lower()}
     model = pycolmap.Reconstruction()
     if not odd and not any(_starts_with_mark(file) for file in files):
@@ -32,7 +32,7 @@ def read_text_model(path: Path) -> pycolmap.Reconstruction:
             lines[row] = _NO_NUMBER.sub(str(_FAR), lines[row])
         with working_folder() as folder:
             for file in files:
-                (folder / file.name).write_bytes(file.read_bytes().removeprefix(codecs.BOM_UTF8))
+                (folder / file.name).write_bytes(read_bytes(file).removeprefix(codecs.BOM_UTF8))
             (folder / "images.txt").write_text("\n".join(lines), "utf-8")
             model.read_text(folder)
     for row in _keypoint_rows(lines):

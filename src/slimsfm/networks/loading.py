@@ -8,11 +8,13 @@ from types import ModuleType
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 from urllib.request import getproxies
+from zipfile import ZIP_STORED, ZipFile, is_zipfile
 
 import torch
 from torch import Tensor, nn
 
 from slimsfm.errors import InputError
+from slimsfm.limits import check_bytes
 from slimsfm.weights import WEIGHTS, check_weights, current_runtime, find_weights, missing, remind_of_license
 
 
@@ -114,13 +116,20 @@ def _name(network: nn.Module) -> str:
 
 
 def _read(path: Path) -> Mapping:
-    """Read a weight file without running code that it may contain."""
+    """Read a weight file without running code that it may contain; its parts must not be compressed."""
     try:
+        check_bytes(path, path.stat().st_size)
+        if is_zipfile(path):
+            with ZipFile(path) as archive:
+                if any(one.compress_type != ZIP_STORED for one in archive.infolist()):
+                    raise ValueError("its parts are compressed")
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(path)
         return torch.load(path, map_location="cpu", weights_only=False, pickle_module=_HARMLESS)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # damaged files raise all kinds of exceptions

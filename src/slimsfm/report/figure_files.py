@@ -15,7 +15,7 @@ from slimsfm.arrays import Image
 from slimsfm.errors import ImageError, InputError
 from slimsfm.evaluation.results import Measurement, ObjectResult, Outcomes, Run, join_outcomes
 from slimsfm.evaluation.table import BY_FRAME, average_rows, rows_of
-from slimsfm.files import replacing
+from slimsfm.files import inside, replacing
 from slimsfm.mapping.subset import keep_images
 from slimsfm.photos import Orientation, read_image, shrink
 from slimsfm.progress import ProgressBar, silent
@@ -108,7 +108,7 @@ class _Writer:
     warnings: dict[str, str] = field(default_factory=dict)
 
     def add(self, place: Path, kind: str) -> Path:
-        path = self.folder / place
+        path = inside(self.folder, place.as_posix())
         self.files[path] = _EXPLANATIONS[kind]
         return path
 
@@ -121,6 +121,13 @@ class _Writer:
             return read_image(path, orientation)
         except ImageError as error:
             self.warnings.setdefault("photos", f"{error}; missing photos are left out")
+            return None
+
+    def read_reference(self, folder: Path, name: str) -> Image | None:
+        try:
+            return self.read(inside(folder, name), "upright")
+        except InputError as error:
+            self.warnings.setdefault("photos", f"{error}; such photos are left out")
             return None
 
 
@@ -140,7 +147,7 @@ def _write_method(writer: _Writer, maps: RunMaps) -> None:
     place = Path(result.name) / mapped.method
     reduced = keep_images(full, mapped.dominating_set)
     writer.save(before_after_figure(full, reduced), place, "before-after")
-    photos = {name: writer.read(result.images / name, "upright") for name in maps.graph.names}
+    photos = {name: writer.read_reference(result.images, name) for name in maps.graph.names}
     thumbnails = {name: shrink(photo, _THUMBNAIL_PX) for name, photo in photos.items() if photo is not None}
     drawing = GraphDrawing(graph=maps.graph, threshold=maps.threshold, chosen=mapped.dominating_set)
     writer.save(graph_figure(drawing, thumbnails), place, "graph")

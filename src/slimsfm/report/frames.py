@@ -13,7 +13,8 @@ from jaxtyping import Float64
 from PIL import Image as PillowImage
 
 from slimsfm.arrays import Image
-from slimsfm.errors import ImageError
+from slimsfm.errors import InputError
+from slimsfm.files import inside
 from slimsfm.geometry import BOX_EDGES, Box, project
 from slimsfm.photos import read_image, shrink
 
@@ -151,9 +152,9 @@ def jpeg_uri(image: Image, *, thin_lines: bool) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-def photo_uri(path: Path, max_size: int) -> str | None:
+def photo_uri(folder: Path, name: str, max_size: int) -> str | None:
     """A photo as a data URI, its longer side at most `max_size` pixels; None if it cannot be read."""
     try:
-        return jpeg_uri(shrink(read_image(path), max_size), thin_lines=False)
-    except ImageError:
+        return jpeg_uri(shrink(read_image(inside(folder, name)), max_size), thin_lines=False)
+    except InputError:
         return None

@@ -120,7 +120,7 @@ def _nodes(
         x, y = places[i] - (width / 2, height / 2)
         frame = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}"'
         is_chosen = name in drawing.chosen
-        uri = photo_uri(photos / name, photo_px or _MIN_PHOTO_PX) if photo_px or is_chosen else None
+        uri = photo_uri(photos, name, photo_px or _MIN_PHOTO_PX) if photo_px or is_chosen else None
         photo = f'<image {frame} preserveAspectRatio="xMidYMid slice" href="{uri}"/>' if uri else ""
         yield (
             f'<g class="node{" kept" * is_chosen}" tabindex="{-1 if i else 0}" role="img" '

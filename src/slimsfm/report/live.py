@@ -16,7 +16,8 @@ import pycolmap
 import viser
 
 from slimsfm.arrays import Image
-from slimsfm.errors import ImageError, InputError
+from slimsfm.errors import InputError
+from slimsfm.files import inside
 from slimsfm.geometry import corner_error
 from slimsfm.image_files import list_images
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
@@ -66,7 +67,7 @@ class LiveQueries:
         Raises:
             ImageError: The image is missing or unreadable.
         """
-        return read_image(self.folder / name, orientation)
+        return read_image(inside(self.folder, name), orientation)
 
 
 @contextmanager
@@ -199,8 +200,8 @@ class LiveView:
         orientation = next(iter(self.maps.values())).map.info.orientation
         for name in progress(names, "photos"):
             try:
-                self.photos[name] = shrink(read_image(folder / name, orientation), MAX_PHOTO_PX)
-            except ImageError:
+                self.photos[name] = shrink(read_image(inside(folder, name), orientation), MAX_PHOTO_PX)
+            except InputError:
                 continue
             for viewer in list(self.viewers.values()):
                 viewer.frusta[name].image = self.photos[name]
@@ -218,7 +219,7 @@ class LiveView:
         """
         assert self.queries is not None
         options = LocalizationOptions(focal=self.queries.focal)
-        map_, path = self.maps[shown].map, self.queries.folder / name
+        map_, path = self.maps[shown].map, inside(self.queries.folder, name)
         image = self.queries.read(name, map_.info.orientation)
         camera = query_camera(map_, path, self.queries.camera, options.focal)
         if shown not in self._localizers:

@@ -4,17 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 
+from slimsfm.errors import InputError
 from slimsfm.evaluation.benchmark import BenchmarkOptions, graph_options, parse_method
 from slimsfm.evaluation.comparison import Comparison, MeasurementKey, against_full
 from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.evaluation.table import BY_FRAME, BY_OBJECT, Row, average_rows, rows_of
 from slimsfm.evaluation.variants import parse_variant
+from slimsfm.files import contents_of
 from slimsfm.graph import ReferenceGraph
 from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.mapping.io import read_map
 from slimsfm.mapping.map import Map
 from slimsfm.reduction import DominatingSetOptions
 
+_AGAIN = "run the benchmark again"
 _HEADLINES = ("default", "dominating")
 _FULL_OBJECTS = 6  # with more objects, each gets a share of the limits
 _PHOTO_BYTES = 600_000  # all photos of one reference graph
@@ -103,17 +106,23 @@ def load_run_maps(run: Run, result: ObjectResult, method: str) -> RunMaps:
 
     Raises:
         MapError: A map is missing or damaged.
+        InputError: The results are not those of these maps.
     """
-    variants = [cell.variant for cell in result.measurements if cell.method == method]
-    kept = [one for one in dict.fromkeys(("full", *variants)) if not parse_variant(one).is_random]
+    with contents_of(run.folder / "results.json", "damaged", _AGAIN):
+        variants = [cell.variant for cell in result.measurements if cell.method == method]
+        kept = [one for one in dict.fromkeys(("full", *variants)) if not parse_variant(one).is_random]
+        mapped = next(one for one in result.maps if one.method == method)
+        threshold = run.options["reduction"]["threshold"]
+        # all options that the graph depends on
+        reduction = DominatingSetOptions(threshold=threshold)
+        asked = BenchmarkOptions(edges=run.options["edges"], reduction=reduction)
+        options = graph_options(asked, parse_method(method))
     maps = {variant: read_map(run.map_path(result.name, method, variant)) for variant in kept}
-    threshold = run.options["reduction"]["threshold"]
-    # all options that the graph depends on
-    asked = BenchmarkOptions(edges=run.options["edges"], reduction=DominatingSetOptions(threshold=threshold))
-    options = graph_options(asked, parse_method(method))
+    if unknown := set(mapped.dominating_set).difference(maps["full"].images):
+        raise InputError(f"{run.folder}: {min(unknown)!r} of {result.name} is not in its map; {_AGAIN}")
     return RunMaps(
         result=result,
-        mapped=next(one for one in result.maps if one.method == method),
+        mapped=mapped,
         maps=maps,
         graph=load_or_compute_graph(maps["full"], run.map_path(result.name, method, "full"), options).graph,
         threshold=threshold,

@@ -13,6 +13,7 @@ from jaxtyping import Int32, UInt8
 
 from slimsfm.arrays import Image
 from slimsfm.errors import InputError, VideoError
+from slimsfm.limits import check_pixels, current_limits
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -47,10 +48,12 @@ def open_film(path: Path) -> tuple[InputContainer, VideoStream]:
 
     Raises:
         InputError: The file does not exist, cannot be read or has no film; a cover picture is none.
+        ImageError: The film has more pixels than the limit.
     """
     av = pyav()
+    options = {"max_pixels": str(round(1e6 * current_limits().max_megapixels))}  # also of later frames
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), options=options)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such video") from error
     except (av.error.FFmpegError, OSError) as error:
@@ -63,7 +66,10 @@ def open_film(path: Path) -> tuple[InputContainer, VideoStream]:
         container.close()
         raise InputError(f"{path}: contains {what}")
     best = container.streams.best("video")
-    return container, best if best in films else films[0]
+    film = best if best in films else films[0]
+    check_pixels(path, film.codec_context.width, film.codec_context.height)
+    film.codec_context.options = options
+    return container, film
 
 
 def film_pictures(

@@ -15,6 +15,7 @@ from slimsfm.arrays import Descriptors, GrayImage, Ids, Image, Points2D
 from slimsfm.errors import InputError
 from slimsfm.features import Features, unit_rows
 from slimsfm.features.registry import importing, load_object
+from slimsfm.files import inside
 from slimsfm.localization.matching import ReferenceMatching
 from slimsfm.localization.strategy import PointMatches, Query, Target
 from slimsfm.mapping.build import BuildOptions, BuildWork, MapParts
@@ -225,7 +226,7 @@ class PhotoFolder(Mapping[str, Photo]):
     def __getitem__(self, name: str) -> Photo:
         if name not in self._names:
             raise KeyError(name)
-        return read_photo(self._folder / name, self._orientation, warn=False).image
+        return read_photo(inside(self._folder, name), self._orientation, warn=False).image
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

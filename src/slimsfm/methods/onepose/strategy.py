@@ -19,10 +19,11 @@ from torch import Tensor
 
 from slimsfm.arrays import Descriptors, Ids, Points2D
 from slimsfm.errors import MapError
-from slimsfm.features import Extractor, load_extractor, unit_rows
+from slimsfm.features import Extractor, unit_rows
 from slimsfm.localization.matching import matching_with
 from slimsfm.localization.strategies import Direct
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target
+from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.methods.onepose.crop import (
     CROP_PX,
@@ -72,7 +73,7 @@ class OnePoseStrategy:
         self._box = map.box
         self._threshold = threshold
         self._network = load_network(GraphAttentionMatcher(), "onepose", matcher_state)
-        self._extractor = extractor or load_extractor(map.info.extractor, map.info.extractor_options)
+        self._extractor = extractor or extractor_of(map)
         prepared = prepare_points(map)
         self._points = prepared.points
         leaves = prepared.leaves.reshape(-1, DIMENSIONS)
