@@ -1,5 +1,6 @@
 """Whether a camera may exist: what is wrong with intrinsics that no lens and no photo has."""
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +19,7 @@ _STRETCHED = 3.0  # pixels per undistorted pixel in the direction in which they 
 _SQUEEZED = 25.0  # area on the sphere of rays, over the area of its pixels
 _LEAST_SOUND = 1 / 3  # of the cells: calibrations are often wrong where no keypoints were
 _LEAST_OF_CIRCLE = 0.05  # of the cells, around a fisheye's image circle
-_NARROW, _WIDE, _WIDEST = np.tan(np.radians((45, 60, 89.5)))  # rays inside, toward, and at its rim
+_NARROW, _WIDE, _WIDEST = (math.tan(math.radians(angle)) for angle in (45, 60, 89.5))  # of its rays
 
 
 def camera_fault(camera: pycolmap.Camera) -> str | None:
