@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from slimsfm.execution import OpenExecutor, dask_cluster, num_cores, processes
+from slimsfm.files.work_folder import RESUME
 from slimsfm.limits import Limits, use_limits
 from slimsfm.weights import Runtime, use_runtime
 
@@ -41,7 +42,7 @@ def resumable() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interruption:
-        raise KeyboardInterrupt("run the same command again to resume") from interruption
+        raise KeyboardInterrupt(RESUME) from interruption
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,22 +43,22 @@ def work_folder(output: str | Path) -> Iterator[Path]:
             raise OutputError(
                 f"{output}: another process is making it now; wait for that or choose another output"
             )
+        keep = False
         try:
             yield folder
+            created = []
         except KeyboardInterrupt as interruption:
-            if not is_locked or not _holds_work(folder):
-                _remove(folder, created)
-                raise
-            raise KeyboardInterrupt(RESUME) from interruption
+            keep = is_locked is True and _holds_work(folder)
+            if keep:
+                raise KeyboardInterrupt(RESUME) from interruption
+            raise
         except OSError as error:
-            _remove(folder, created)
             if error.errno in _FULL:
                 raise OutputError(f"{output}: cannot be written ({error.strerror})") from error
             raise
-        except BaseException:
-            _remove(folder, created)
-            raise
-        _remove(folder, [])
+        finally:
+            if not keep:
+                _remove(folder, created)
 
 
 def _make(folder: Path) -> list[Path]:
