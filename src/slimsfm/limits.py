@@ -3,6 +3,7 @@
 import os
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cache
 from math import ceil, isfinite
 from pathlib import Path
 
@@ -93,7 +94,13 @@ def current_limits() -> Limits:
     Raises:
         InputError: An environment variable with a default is not a positive number.
     """
-    return _used or Limits.from_environment()
+    return _used or _defaults(os.environ.get(MEGAPIXELS), os.environ.get(FILE_GB))
+
+
+@cache
+def _defaults(_megapixels: str | None, _file_gb: str | None) -> Limits:
+    """The user's defaults, computed once, because they are asked for at each array."""
+    return Limits.from_environment()
 
 
 def check_pixels(source: Path | str, width: int, height: int) -> None:
