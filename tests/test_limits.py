@@ -28,7 +28,7 @@ def test_limits_are_the_option_then_the_environment_then_the_default(monkeypatch
 @pytest.mark.parametrize("value", ["many", "0", "-1", "nan", "inf"])
 def test_impossible_limits_are_refused(monkeypatch, value):
     monkeypatch.setenv(MEGAPIXELS, value)
-    with pytest.raises(InputError, match=MEGAPIXELS):
+    with pytest.raises(InputError, match="must be a positive number"):
         current_limits()
 
 

@@ -3,6 +3,7 @@
 import os
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cache
 from math import ceil, isfinite
 from pathlib import Path
 
@@ -31,7 +32,7 @@ class Limits:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive, got {value}")
+                raise ValueError(f"{name} must be a positive number, got {value}")
 
     @classmethod
     def from_environment(cls, max_megapixels: float | int | None = None) -> "Limits":
@@ -40,17 +41,22 @@ class Limits:
         Raises:
             InputError: A value is not a positive number.
         """
-        given = {"max_megapixels": max_megapixels, "max_file_gb": None}
-        variables = {"max_megapixels": MEGAPIXELS, "max_file_gb": FILE_GB}
+        found = {"max_megapixels": _from_variable(MEGAPIXELS) if max_megapixels is None else max_megapixels}
+        found["max_file_gb"] = _from_variable(FILE_GB)
         try:
-            found = {
-                name: value if value is not None else float(os.environ[variables[name]])
-                for name, value in given.items()
-                if value is not None or os.environ.get(variables[name])
-            }
-            return cls(**found)
+            return cls(**{name: value for name, value in found.items() if value is not None})
         except ValueError as error:
-            raise InputError(f"{error} (environment variables {MEGAPIXELS} and {FILE_GB})") from error
+            raise InputError(str(error)) from error
+
+
+def _from_variable(name: str) -> float | None:
+    text = os.environ.get(name)
+    try:
+        return float(text) if text else None
+    except ValueError as error:
+        raise InputError(
+            f"the environment variable {name} must be a positive number, got {text!r}"
+        ) from error
 
 
 _used: Limits | None = None
@@ -88,7 +94,13 @@ def current_limits() -> Limits:
     Raises:
         InputError: An environment variable with a default is not a positive number.
     """
-    return _used or Limits.from_environment()
+    return _used or _defaults(os.environ.get(MEGAPIXELS), os.environ.get(FILE_GB))
+
+
+@cache
+def _defaults(_megapixels: str | None, _file_gb: str | None) -> Limits:
+    """The user's defaults, computed once, because they are asked for at each array."""
+    return Limits.from_environment()
 
 
 def check_pixels(source: Path | str, width: int, height: int) -> None:

@@ -2,7 +2,7 @@
 
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 
 from commands import state
+from mutations import mutations
 from scenes import exact_map, like_sift, with_matches
 from slimsfm.errors import InputError, ModelError
 from slimsfm.mapping.database import read_database
@@ -184,3 +185,51 @@ def test_descriptors_of_several_extractors_are_refused(tmp_path):
     contents = stored.read()
     assert contents.extractor == "ALIKED_N16ROT"
     assert contents.features["001.png"].descriptors.shape == (50, 32)
+
+
+def test_a_damaged_database_is_read_within_bounds_or_refused(stored):
+    whole = stored.path.read_bytes()
+    for _, damaged in mutations(whole, seed=5, count=60):
+        stored.path.write_bytes(damaged)
+        with suppress(InputError):
+            found = stored.read()
+            assert all(np.isfinite(one.keypoints).all() for one in found.features.values())
+
+
+COMPUTED = {
+    "view": (
+        "ALTER TABLE images RENAME TO others",
+        "CREATE VIEW images AS WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) "
+        "SELECT x image_id, x name, 1 camera_id FROM n",
+    ),
+    "column": (
+        "ALTER TABLE keypoints RENAME TO others",
+        "CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, "
+        "data BLOB AS (zeroblob(1000000000)))",
+        "INSERT INTO keypoints SELECT image_id, rows, cols FROM others",
+    ),
+}
+
+
+@pytest.mark.parametrize("commands", COMPUTED.values(), ids=COMPUTED.keys())
+def test_values_that_a_database_would_compute_are_refused(stored, commands):
+    stored.execute(*commands)
+    with pytest.raises(InputError, match="is not a plain table"):
+        stored.read()
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["rows = -1", "rows = 'many'", "cols = 0", "cols = 1", "rows = 2000000000", "data = zeroblob(7)"],
+)
+def test_impossible_keypoints_are_refused(stored, change):
+    stored.execute(f"UPDATE keypoints SET {change}")
+    with pytest.raises(InputError, match="not readable as a COLMAP database"):
+        stored.read()
+
+
+def test_keypoints_that_are_not_finite_are_refused(stored):
+    nan = np.full(1, np.nan, np.float32).tobytes().hex()
+    stored.execute(f"UPDATE keypoints SET data = CAST(x'{nan}' || substr(data, 5) AS BLOB)")
+    with pytest.raises(InputError, match=r"features of image .* that are not finite"):
+        stored.read()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from slimsfm.execution import OpenExecutor, dask_cluster, num_cores, processes
-from slimsfm.files.work_folder import RESUME
+from slimsfm.files.resumable import RESUME
 from slimsfm.limits import Limits, use_limits
 from slimsfm.weights import Runtime, use_runtime
 

@@ -5,7 +5,7 @@ from typing import Annotated
 from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map, plural
-from slimsfm.files.work_folder import work_folder
+from slimsfm.files.resumable import resumable_folder
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
 from slimsfm.mapping.space import bytes_to_build
@@ -38,7 +38,7 @@ def build_photos(
     reading.apply()
     needed = bytes_to_build(images, build)
     check_output(output, images, build.masks, build.box, overwrite=overwrite, least_bytes=needed)
-    with work_folder(output) as workspace:
+    with resumable_folder(output) as workspace:
         made = build_map(images, build, workspace=workspace, progress=shown)
         write_map(made, output, overwrite=overwrite)
     if made.unregistered:

@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
+from slimsfm.errors import InputError
 from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, ObjectResult, Outcomes, PosedQuery
 from slimsfm.evaluation.variants import parse_variant
 from slimsfm.files import inside, plain
@@ -25,8 +26,8 @@ def object_from_json(data: dict) -> ObjectResult:
     """The results of an object, from plain values.
 
     Raises:
-        InputError: A name would lead out of the folder of the run.
-        Exception: A value is missing, of another type or impossible: parse inside `contents_of`.
+        Exception: A value is missing, of another type or impossible, or a name would lead out of the folder
+            of the run: parse inside `contents_of`.
     """
     found = ObjectResult(
         name=_folder_name(data["name"]),
@@ -59,7 +60,10 @@ def _check(found: ObjectResult) -> None:
 def _folder_name(value: Any) -> str:
     """A name that is that of a folder in the run."""
     name = plain(value, str)
-    inside(Path("maps"), name)
+    try:
+        inside(Path("maps"), name)
+    except InputError as error:
+        raise ValueError(str(error)) from error
     return name
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Float32, Integer
 from slimsfm.arrays import IndexPairs
 from slimsfm.features.base import Features
 from slimsfm.files import contents_of, uninterrupted
-from slimsfm.files.hdf5 import creating, groups_with, opened, read_array, shape_and_type
+from slimsfm.files.hdf5 import creating, datasets_of, groups_with, opened, read_array, shape_and_type
 
 _PIXEL_CENTER = np.float32(0.5)
 _INT16_MAX = np.iinfo(np.int16).max
@@ -48,15 +48,16 @@ class FeatureFile(Mapping[str, Features]):
         self._path = path
         spelled = {stored_name(name): name for name in names}
         with contents_of(path, "damaged", _AGAIN):
-            stored = groups_with(self._file, "keypoints")
-        self._names = dict.fromkeys(sorted(spelled.get(name, name) for name in stored))
+            self._stored = set(datasets_of(self._file))
+        groups = groups_with(self._stored, "keypoints")
+        self._names = dict.fromkeys(sorted(spelled.get(name, name) for name in groups))
         self._kind: tuple[int, np.dtype] | None = None  # of the descriptors of the first image that has some
 
     def __getitem__(self, name: str) -> Features:
         if name not in self._names:
             raise KeyError(name)
         with self._contents_of(name):
-            features = _read_features(self._file, name)
+            features = _read_features(self._file, stored_name(name), self._stored)
             count, length = features.descriptors.shape
             self._check_kind(count, length, features.descriptors.dtype)
         return features
@@ -96,23 +97,25 @@ def stored_name(name: str) -> str:
     return "/".join(part for part in name.split("/") if part not in ("", "."))
 
 
-def _read_features(file: h5py.File, name: str) -> Features:
+def _read_features(file: h5py.File, name: str, stored: set[str]) -> Features:
     keypoints = _read_floats(file, f"{name}/keypoints")
-    if f"{name}/descriptors" not in file:
+    if f"{name}/descriptors" not in stored:
         raise ValueError("keypoints without descriptors")
     descriptors = _finite(read_array(file, f"{name}/descriptors"), "descriptors").T
-    scores = _read_floats(file, f"{name}/scores") if f"{name}/scores" in file else np.ones(len(keypoints))
+    scores = _read_floats(file, f"{name}/scores") if f"{name}/scores" in stored else np.ones(len(keypoints))
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
         raise ValueError(f"{keypoints.shape} keypoints with {descriptors.T.shape} descriptors")
     if not (len(keypoints),) == (len(descriptors),) == scores.shape:
         raise ValueError(f"{len(keypoints)} keypoints, {len(descriptors)} descriptors, {scores.shape} scores")
-    size = read_array(file, f"{name}/image_size") if f"{name}/image_size" in file else np.zeros(2)
+    size = read_array(file, f"{name}/image_size") if f"{name}/image_size" in stored else np.zeros(2)
     return Features(
         keypoints=np.ascontiguousarray(keypoints[:, :2]) + _PIXEL_CENTER,
         descriptors=np.ascontiguousarray(descriptors),
         scores=np.asarray(scores, np.float32),
         image_size=(int(size[0]), int(size[1])),
-        frames=_read_frames(file, name, len(keypoints)),
+        frames=_read_frames(file, name, len(keypoints))
+        if {f"{name}/scales", f"{name}/oris"} <= stored
+        else None,
     )
 
 
@@ -127,9 +130,7 @@ def _finite(values: np.ndarray, what: str) -> np.ndarray:
     return values
 
 
-def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, "n 2"] | None:
-    if f"{name}/scales" not in file or f"{name}/oris" not in file:
-        return None
+def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, "n 2"]:
     frames = np.stack([_read_floats(file, f"{name}/{part}") for part in ("scales", "oris")], axis=1)
     if frames.shape != (count, 2):
         raise ValueError(f"{count} keypoints with scales and oris of shape {frames.shape}")
@@ -160,7 +161,7 @@ class MatchFile(Mapping[tuple[str, str], IndexPairs]):
         self._path, self._num_keypoints = path, num_keypoints
         by_key = {key: name for name, key in _keys(names).items()}
         with contents_of(path, "damaged", _AGAIN):
-            groups = groups_with(self._file, "matches0")
+            groups = groups_with(datasets_of(self._file), "matches0")
         pairs = ((_pair_of(group, by_key), group) for group in groups)
         found = {pair: group for pair, group in pairs if pair is not None}
         self._groups = {pair: found[pair] for pair in sorted(found)}

@@ -5,7 +5,7 @@ allocated only if the file can hold it, because HDF5 believes a damaged header t
 """
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import FileIO
 from math import prod
@@ -44,14 +44,10 @@ def datasets_of(file: h5py.File) -> list[str]:
     return [name for name in names if name not in groups]
 
 
-def groups_with(file: h5py.File, dataset: str) -> list[str]:
-    """Names of all groups that hold a dataset of this name.
-
-    Raises:
-        ValueError: As in `datasets_of`.
-    """
-    end = f"/{dataset}"
-    return [name.removesuffix(end) for name in datasets_of(file) if name.endswith(end)]
+def groups_with(datasets: Iterable[str], part: str) -> list[str]:
+    """Names of the groups that hold a dataset of this name, of the names that `datasets_of` gives."""
+    end = f"/{part}"
+    return [name.removesuffix(end) for name in datasets if name.endswith(end)]
 
 
 def shape_and_type(file: h5py.File, name: str) -> tuple[tuple[int, ...], np.dtype]:
@@ -75,8 +71,13 @@ def read_array(file: h5py.File, name: str) -> np.ndarray:
         OSError: It is damaged.
     """
     found = _dataset(file, name)
-    _check_size(found, file.id.get_filesize())
-    values = np.empty(found.shape, found.dtype)
+    shape, kind = found.shape, found.dtype
+    claimed = prod(shape) * kind.itemsize
+    stored = min(found.get_storage_size(), file.id.get_filesize())
+    if claimed > stored or found.get_offset() is None:
+        _check_packed(found, claimed, stored)
+    check_bytes("an array", claimed)
+    values = np.empty(shape, kind)
     found.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values
 
@@ -86,24 +87,24 @@ def _dataset(file: h5py.File, name: str) -> h5py.h5d.DatasetID:
         found = h5py.h5d.open(file.id, name.encode())
     except TypeError as error:
         raise KeyError(f"{name} is not a dataset") from error
-    plan = found.get_create_plist()
-    if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count():
-        raise ValueError(f"{name} lies in other files, which are not read")
+    if found.get_offset() is None:  # not in one piece in this file; the plan takes longer to ask for
+        plan = found.get_create_plist()
+        if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count():
+            raise ValueError(f"{name} lies in other files, which are not read")
     if found.dtype.kind not in _NUMBERS:
         raise ValueError(f"{name} does not hold numbers")
     return found
 
 
-def _check_size(found: h5py.h5d.DatasetID, file_bytes: int) -> None:
-    """Check that the file can hold an array of the claimed size."""
-    plan, claimed = found.get_create_plist(), prod(found.shape) * found.dtype.itemsize
-    stored = min(found.get_storage_size(), file_bytes)
+def _check_packed(found: h5py.h5d.DatasetID, claimed: int, stored: int) -> None:
+    """Check that so many stored bytes can hold the claimed ones, unpacked."""
+    plan = found.get_create_plist()
     filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
     if unknown := set(filters).difference(_FILTERS):
         raise ValueError(f"it is packed by an unknown filter ({min(unknown)})")
-    if plan.get_layout() == h5py.h5d.CHUNKED:
+    if plan.get_layout() == h5py.h5d.CHUNKED and stored:
         chunk = prod(plan.get_chunk()) * found.dtype.itemsize
-        claimed = max(claimed, chunk) if stored else claimed
+        claimed = max(claimed, chunk)
         if h5py.h5z.FILTER_DEFLATE in filters and stored > _SMALL_CHUNK:
             _check_chunks(found, chunk)
     if claimed > stored * (_MAX_RATIO if filters else 1):

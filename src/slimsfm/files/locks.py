@@ -43,15 +43,30 @@ def locked(path: Path, *, shared: bool = False, wait_s: float = 0.0) -> Iterator
     Yields:
         Whether the lock is held; None if there is nothing at the path, or its file system has no locks.
     """
+    end, held, descriptor = monotonic() + wait_s, None, None
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        yield None
-        return
-    try:
-        yield _lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, monotonic() + wait_s)
+        while held is None and (descriptor := _opened(path)) is not None:
+            held = _lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, end)
+            if held is None or _is_at(path, descriptor):
+                break
+            os.close(descriptor)  # replaced or removed in the meantime
+            held = descriptor = None
+        yield held
     finally:
-        os.close(descriptor)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _opened(path: Path) -> int | None:
+    try:
+        return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return None
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    found = os.fstat(descriptor)
+    return identity(path) == Identity(found.st_dev, found.st_ino)
 
 
 def _lock(descriptor: int, kind: int, end: float) -> bool | None:

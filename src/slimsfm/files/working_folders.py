@@ -25,8 +25,8 @@ def working_folder(parent: Path | None = None) -> Iterator[Path]:
     """
     while True:
         folder = Path(tempfile.mkdtemp(dir=parent, prefix=_PREFIX, suffix=_SUFFIX))
-        with locked(folder):
-            if not folder.exists():  # taken for abandoned before it was locked
+        with locked(folder) as held:
+            if not held and not folder.exists():  # taken for abandoned before it was locked
                 continue
             try:
                 yield folder

@@ -5,7 +5,7 @@ import errno
 import pytest
 
 from slimsfm.errors import InputError, OutputError
-from slimsfm.files.work_folder import RESUME, work_folder
+from slimsfm.files.resumable import RESUME, resumable_folder
 
 
 def begin(folder):
@@ -15,14 +15,14 @@ def begin(folder):
 
 def work(output, ends_with):
     """Work that has a part when it ends with an exception."""
-    with work_folder(output) as folder:
+    with resumable_folder(output) as folder:
         begin(folder)
         raise ends_with
 
 
 def test_the_folder_is_removed_after_success_and_errors_with_the_folders_made_for_it(tmp_path):
     output = tmp_path / "new" / "map"
-    with work_folder(output) as folder:
+    with resumable_folder(output) as folder:
         begin(folder)
         assert folder == tmp_path / "new" / ".map.build"
     assert list((tmp_path / "new").iterdir()) == []
@@ -33,23 +33,23 @@ def test_the_folder_is_removed_after_success_and_errors_with_the_folders_made_fo
 
 
 def test_an_interruption_keeps_the_folder_if_there_is_work_in_it(tmp_path):
-    with pytest.raises(KeyboardInterrupt) as nothing, work_folder(tmp_path / "map"):
+    with pytest.raises(KeyboardInterrupt) as nothing, resumable_folder(tmp_path / "map"):
         raise KeyboardInterrupt
     assert str(nothing.value) == ""
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(KeyboardInterrupt, match=RESUME):
         work(tmp_path / "map", KeyboardInterrupt())
-    with work_folder(tmp_path / "map") as folder:
+    with resumable_folder(tmp_path / "map") as folder:
         assert (folder / "part" / "done").exists()
 
 
 def test_two_processes_do_not_share_the_folder(tmp_path):
-    with work_folder(tmp_path / "map") as folder:
+    with resumable_folder(tmp_path / "map") as folder:
         begin(folder)
         with pytest.raises(OutputError, match=r"map: another process is making it now"):
-            work_folder(tmp_path / "map").__enter__()
+            resumable_folder(tmp_path / "map").__enter__()
         assert (folder / "part" / "done").exists()
-        with work_folder(tmp_path / "other"):
+        with resumable_folder(tmp_path / "other"):
             pass
 
 
