@@ -52,3 +52,10 @@ def test_the_largest_distance_agrees_with_brute_force(flat):
     points = np.random.default_rng(0).normal(size=(200, 3)) * (1, 1, 0 if flat else 1)
     expected = np.linalg.norm(points[:, None] - points[None], axis=2).max()
     assert largest_distance(points) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("focal", "center"), [(1e300, 30), (0.1, 30), (100, 1e6)])
+def test_an_impossible_matrix_is_named(focal, center):
+    matrix = np.array([[focal, 0, center], [0, focal, 20], [0, 0, 1.0]])
+    with pytest.raises(InputError, match=r"K\.txt: the camera is impossible: its .* correct the matrix"):
+        pinhole_camera(matrix, (64, 48), "K.txt")

@@ -114,6 +114,8 @@ def test_a_camera_file_of_colmap_is_read(model, tmp_path):
         "1 PINWHEEL 640 480 500 500 320 240\n",
         "1 EQUIRECTANGULAR 640 320 640 320\n",
         "1 PINHOLE 640\n",
+        "1 OPENCV 1024 768 700 700 512 384 1e9 1e9 1e9 1e9\n",
+        "1 PINHOLE 640 480 1e300 500 320 240\n",
         "1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 640 480 500 500 320 240\n",
     ],
 )

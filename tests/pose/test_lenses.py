@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 from lenses import MODELS, distorted
 
-from slimsfm.geometry import resized_camera
+from slimsfm.geometry import project, resized_camera
 from slimsfm.lenses import camera_fault
 
 DISTORTED = [model for model in MODELS if len(distorted(model).extra_params_idxs())]
@@ -93,6 +93,14 @@ def test_absurd_sizes_focal_lengths_and_principal_points_are_impossible(model):
             assert "finite" in camera_fault(changed(lens, place, value))
     for width, height in ((0, 480), (640, 0), (2**40, 480)):
         assert "size" in camera_fault(camera_of(model, width, height, lens.params))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_points_behind_the_camera_do_not_project(model):
+    points = np.random.default_rng(0).uniform((-1, -1, -3), (1, 1, 3), (200, 3))
+    pixels = project(points, pycolmap.Rigid3d(), distorted(model))
+    assert np.isnan(pixels[points[:, 2] <= 0]).all()
+    assert np.isfinite(pixels[points[:, 2] > 1]).all()
 
 
 def test_focal_lengths_that_differ_by_far_and_spheres_are_impossible():

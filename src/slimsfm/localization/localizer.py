@@ -138,7 +138,8 @@ class Localizer:
             mask: Of the size of the image; features where it is 0 are not used.
 
         Raises:
-            ValueError: The camera has another image size, or none is given and the map's does not fit.
+            ValueError: The camera has another image size or is impossible, or none is given and the map's
+                does not fit.
         """
         camera = self.camera_of(image, camera)
         start = perf_counter()
@@ -196,6 +197,9 @@ class Localizer:
             camera: Its intrinsics.
             gravity: As in `localize`.
             image: RGB, as in `localize`; needed only if `looks_at_images`.
+
+        Raises:
+            ValueError: The camera is impossible.
         """
         camera = _given(camera)
         query = self._query(features, camera.camera, image)
