@@ -20,7 +20,7 @@ from slimsfm.mapping.pairs import Matches, PairChoice
 from slimsfm.mapping.workspace import Workspace
 from slimsfm.photos import Orientation
 from slimsfm.progress import ProgressBar
-from slimsfm.weights import chosen_runtime
+from slimsfm.weights import current_runtime
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,10 +117,20 @@ def build_key(
         "versions": [version("slimsfm"), pycolmap.__version__, cv2.__version__],
         "images": [str(images.resolve()), *names],
         "files": [[str(path), *_stamp(path)] for path in files],
-        "extractor": [extractor.name, repr(extractor.options), repr(chosen_runtime())],
+        "extractor": [extractor.name, repr(extractor.options)],
+        "networks": _networks(options),
         "options": {name: value for name, value in chosen.items() if name not in later},
         "known": known and [[name, _text(known, name)] for name in names],
     }
+
+
+def _networks(options: BuildOptions) -> list:
+    """Device and weight files of learned methods; empty if none is used."""
+    if (options.extractor, options.matcher) == ("sift", "nearest"):
+        return []
+    runtime = current_runtime()
+    files = sorted(runtime.weights.iterdir()) if runtime.weights else []
+    return [runtime.device, *([path.name, *_stamp(path)] for path in files)]
 
 
 def _stamp(path: Path) -> tuple[int, int]:
