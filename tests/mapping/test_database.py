@@ -192,8 +192,7 @@ def test_a_damaged_database_is_read_within_bounds_or_refused(stored):
     for _, damaged in mutations(whole, seed=5, count=60):
         stored.path.write_bytes(damaged)
         with suppress(InputError):
-            found = stored.read()
-            assert all(np.isfinite(one.keypoints).all() for one in found.features.values())
+            assert all(len(one) == len(one.descriptors) for one in stored.read().features.values())
 
 
 COMPUTED = {
@@ -225,11 +224,4 @@ def test_values_that_a_database_would_compute_are_refused(stored, commands):
 def test_impossible_keypoints_are_refused(stored, change):
     stored.execute(f"UPDATE keypoints SET {change}")
     with pytest.raises(InputError, match="not readable as a COLMAP database"):
-        stored.read()
-
-
-def test_keypoints_that_are_not_finite_are_refused(stored):
-    nan = np.full(1, np.nan, np.float32).tobytes().hex()
-    stored.execute(f"UPDATE keypoints SET data = CAST(x'{nan}' || substr(data, 5) AS BLOB)")
-    with pytest.raises(InputError, match=r"features of image .* that are not finite"):
         stored.read()

@@ -36,8 +36,10 @@ class Sift:
     """Least contrast of a keypoint; 0.02 at three scales per octave equals COLMAP's 0.0067 per scale."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.max_features <= _MOST_FEATURES:
-            raise ValueError(f"max_features must be from 1 to {_MOST_FEATURES}, got {self.max_features}")
+        if self.max_features < 1:
+            raise ValueError(f"max_features must be at least 1, got {self.max_features}")
+        if self.max_features > _MOST_FEATURES:
+            raise ValueError(f"max_features must be at most {_MOST_FEATURES}, got {self.max_features}")
         if self.max_image_size < 16:
             raise ValueError(f"max_image_size must be at least 16, got {self.max_image_size}")
         if not self.contrast_threshold > 0:

@@ -38,14 +38,19 @@ class FeatureFile(Mapping[str, Features]):
 
     HDF5 forgets how a name was spelled, so that `names` gives the spelling of the images that have one.
 
+    Args:
+        path: The file.
+        names: Names of images as they are spelled elsewhere.
+        finite: Whether an entry is damaged if a value is not finite; off where the caller sorts such out.
+
     Raises:
         InputError: The file is missing or damaged, at construction; an entry is damaged, or its descriptors
             have another length or type than those of other images, at access.
     """
 
-    def __init__(self, path: Path, names: Iterable[str] = ()) -> None:
+    def __init__(self, path: Path, names: Iterable[str] = (), *, finite: bool = True) -> None:
         self._file = opened(path)
-        self._path = path
+        self._path, self._finite = path, finite
         spelled = {stored_name(name): name for name in names}
         with contents_of(path, "damaged", _AGAIN):
             self._stored = set(datasets_of(self._file))
@@ -58,6 +63,8 @@ class FeatureFile(Mapping[str, Features]):
             raise KeyError(name)
         with self._contents_of(name):
             features = _read_features(self._file, stored_name(name), self._stored)
+            if self._finite:
+                _check_finite(features)
             count, length = features.descriptors.shape
             self._check_kind(count, length, features.descriptors.dtype)
         return features
@@ -101,7 +108,7 @@ def _read_features(file: h5py.File, name: str, stored: set[str]) -> Features:
     keypoints = _read_floats(file, f"{name}/keypoints")
     if f"{name}/descriptors" not in stored:
         raise ValueError("keypoints without descriptors")
-    descriptors = _finite(read_array(file, f"{name}/descriptors"), "descriptors").T
+    descriptors = read_array(file, f"{name}/descriptors").T
     scores = _read_floats(file, f"{name}/scores") if f"{name}/scores" in stored else np.ones(len(keypoints))
     if keypoints.ndim != 2 or keypoints.shape[1] < 2 or descriptors.ndim != 2:
         raise ValueError(f"{keypoints.shape} keypoints with {descriptors.T.shape} descriptors")
@@ -121,13 +128,14 @@ def _read_features(file: h5py.File, name: str, stored: set[str]) -> Features:
 
 def _read_floats(file: h5py.File, name: str) -> Float32[np.ndarray, "..."]:
     with np.errstate(over="ignore"):
-        return _finite(read_array(file, name).astype(np.float32), name.rpartition("/")[2])
+        return read_array(file, name).astype(np.float32)
 
 
-def _finite(values: np.ndarray, what: str) -> np.ndarray:
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise ValueError(f"some of its {what} are not finite")
-    return values
+def _check_finite(features: Features) -> None:
+    for part in ("keypoints", "descriptors", "scores", "frames"):
+        values = getattr(features, part)
+        if values is not None and values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise ValueError(f"some of its {part} are not finite")
 
 
 def _read_frames(file: h5py.File, name: str, count: int) -> Float32[np.ndarray, "n 2"]:

@@ -19,12 +19,15 @@ def contents_of(path: Path, what: str, advice: str = "") -> Iterator[None]:
         advice: What to do.
 
     Raises:
-        InputError: The block raised an error; one that a user can fix already is raised as it is.
+        InputError: The block raised an error.
+        SlimsfmError: The block raised this, with or without the name of the file.
     """
     try:
         yield
-    except SlimsfmError:
-        raise
+    except SlimsfmError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"{path}: {error}") from error
     except Exception as error:
         raise InputError(f"{path}: {what} ({_reason(error)}){'; ' * bool(advice)}{advice}") from error
 

@@ -110,8 +110,6 @@ def _read(path: Path, database: sqlite3.Connection, names: set[str]) -> Database
             )
         is_sift = extractor in _SIFT
         descriptors = descriptors if is_sift else descriptors.view(np.float32)
-        if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
-            raise ValueError(f"features of image {name!r} that are not finite")
         features[name] = Features(
             keypoints=np.ascontiguousarray(keypoints[:, :2]),
             descriptors=descriptors,

@@ -106,7 +106,7 @@ def from_hloc(images: list[pycolmap.Image], path: Path, matches: Path | None, ex
         ModelError: The features lack an image, or the matches lack all pairs.
     """
     extractor_entry(extractor)
-    stored = FeatureFile(path, [image.name for image in images])
+    stored = FeatureFile(path, [image.name for image in images], finite=False)
     if not stored:
         raise InputError(f"{path}: holds no features (groups with `keypoints`); give hloc's features.h5")
     features = {image.name: stored[image.name] for image in images if image.name in stored}
