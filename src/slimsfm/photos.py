@@ -335,6 +335,8 @@ def reading(path: str | Path) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise ImageError(f"{path}: no such image") from error
+    except PermissionError as error:
+        raise ImageError(f"{path}: may not be read; change its permissions or remove it") from error
     except _UNREADABLE as error:
         raise ImageError(
             f"{path}: not a readable image: damaged, or of a kind that is not supported; convert, replace or "

@@ -13,10 +13,10 @@ from slimsfm.evaluation.results import MappedObject, MapRun, Measurement, Object
 from slimsfm.evaluation.variants import parse_variant
 from slimsfm.files import inside, plain
 from slimsfm.geometry import Box
+from slimsfm.lenses import camera_fault
 from slimsfm.photos import Orientation
 
 _UNIT = 1e-6  # how far from 1 the length of a quaternion may be
-_MOST_PIXELS = 1_000_000  # along a side
 
 Numbers = list[float | None]
 Poses = list[list[float] | None]
@@ -87,10 +87,8 @@ def _query_from_json(data: dict) -> PosedQuery:
         height=plain(data["camera"]["height"], int),
         params=plain(data["camera"]["params"], list[float]),
     )
-    if not camera.verify_params() or not 0 < min(camera.width, camera.height) <= _MOST_PIXELS:
-        raise ValueError(
-            f"a camera of {camera.width}x{camera.height} pixels with {len(camera.params)} parameters"
-        )
+    if fault := camera_fault(camera):
+        raise ValueError(f"an impossible camera: {fault}")
     return PosedQuery(
         path=Path(plain(data["path"], str)),
         camera=camera,
