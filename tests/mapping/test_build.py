@@ -175,7 +175,7 @@ def test_a_given_box_is_used(rendered, tmp_path):
     map_ = build_map(rendered.folder, options, known=rendered.known)
     assert map_.info.box_source == "given"
     assert map_.box.diagonal == pytest.approx(rendered.known.box.diagonal)
-    with pytest.raises(InputError, match="no such box file"):
+    with pytest.raises(InputError, match="there is no such file"):
         build_map(rendered.folder, BuildOptions(box=tmp_path / "missing.txt"))
 
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scenes import without_checksums
 from slimsfm.errors import InputError, MapError
 from slimsfm.features import unit_rows
 from slimsfm.localization.point_descriptors import describe_points
@@ -160,6 +161,9 @@ def test_a_map_with_damaged_points_names_their_file(exact, tmp_path, kind):
             np.save(file, points)
     else:
         path.write_bytes({"text": b"no points here", "nothing": b""}.get(kind, whole[: len(whole) // 2]))
+    with pytest.raises(MapError, match=r"points.npz: (damaged|missing).*copy it again"):
+        read_map(tmp_path / "map")
+    without_checksums(tmp_path / "map")
     with pytest.raises(MapError, match=r"points.npz: damaged .*reduce the full map again") as refusal:
         read_map(tmp_path / "map")
     assert str(path) in str(refusal.value)

@@ -8,9 +8,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from scenes import exact_map
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.features import Features
 from slimsfm.geometry import project
+from slimsfm.mapping import sfm
 from slimsfm.mapping.choice import CheckedModel, pick_model
 from slimsfm.mapping.pairs import verify_pairs
 from slimsfm.mapping.reconstruction import reconstruct
@@ -212,3 +214,17 @@ def test_a_right_model_does_not_hide_a_contradicted_one(tmp_path):
     assert set(other.names) <= names
     assert len(names & set(folded.names)) >= 18
     assert all(one.is_right for one in models)
+
+
+@pytest.mark.parametrize("bad", [0, 2, 4])
+def test_images_whose_camera_came_out_impossible_are_left_out(bad):
+    model = exact_map(num_images=6).model
+    for image_id in range(1, bad + 1):
+        camera = pycolmap.Camera.create_from_model_name(1 + image_id, "SIMPLE_RADIAL", 500.0, 640, 480)
+        camera.params = [500.0, 320.0, 240.0, -6.4]
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=f"bad{image_id}", camera_id=1 + image_id, image_id=100 + image_id)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    sfm.drop_impossible(model)
+    assert model.num_reg_images() == 6
+    assert {model.image(i).camera_id for i in model.reg_image_ids()} == {1}

@@ -188,7 +188,7 @@ def test_the_orientation_survives_writing_and_old_maps_are_upright(upright, stor
     file.write_text(json.dumps(data))
     assert read_map(tmp_path / "upright").info.orientation == "upright"
     file.write_text(json.dumps({**data, "orientation": "sideways"}))
-    with pytest.raises(MapError, match=r"map\.json: damaged \(orientation must be one of upright, stored"):
+    with pytest.raises(MapError, match=r"map\.json: damaged \('sideways' is not one of upright, stored"):
         read_map(tmp_path / "upright")
 
 

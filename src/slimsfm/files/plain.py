@@ -39,7 +39,10 @@ def plain(value: Any, hint: Any) -> Any:
         return _plain_dataclass(value, hint)
     if _is_simple(value, hint):
         return float(value) if hint is float else value
-    raise ValueError(f"{str(value)[:50]!r} is not {getattr(hint, '__name__', hint)}")
+    expected = (
+        f"one of {', '.join(map(str, arguments))}" if origin is Literal else getattr(hint, "__name__", hint)
+    )
+    raise ValueError(f"{str(value)[:50]!r} is not {expected}")
 
 
 def _plain_union(value: Any, hints: tuple[Any, ...]) -> Any:

@@ -1,7 +1,8 @@
 """Computation of a reference graph: in blocks of pairs, in any process, resumed where it was interrupted."""
 
 import os
-from contextlib import closing, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -135,16 +136,27 @@ def load_or_compute_graph(
     if not os.access(folder, os.W_OK):
         return compute_graph(map, options, work, progress)
     checkpoint = path.with_suffix(".partial")
-    with suppress(OSError):  # the checkpoint reports it
-        checkpoint.touch()
-    with locked(checkpoint) as held:
-        if held is False:  # another process computes this graph and will keep it
+    with _claimed(checkpoint) as ours:
+        if not ours:  # another process computes this graph and will keep it
             return compute_graph(map, options, work, progress)
         run = compute_graph(map, options, replace(work, checkpoint=checkpoint), progress)
         with suppress(OutputExistsError):  # another process was faster
             write_graph(path, run.graph, key=key, pairs_tried=run.pairs_tried)
         remove(checkpoint)
     return run
+
+
+@contextmanager
+def _claimed(checkpoint: Path) -> Iterator[bool]:
+    """Whether this process alone writes the checkpoint within the context; it stays if it holds anything."""
+    with suppress(OSError):  # `Checkpoint` reports it
+        checkpoint.touch()
+    with locked(checkpoint) as held:
+        try:
+            yield held is not False
+        finally:
+            if held and checkpoint.exists() and not checkpoint.stat().st_size:
+                remove(checkpoint)
 
 
 def _in_tiles(pairs: PairIndices) -> PairIndices:

@@ -37,6 +37,7 @@ from slimsfm.photos import decode_jpeg, shrink
 _QUALITY = 95
 _AGAIN = "build the map again"
 _PARTS = "features.h5", "matches.h5", "photos.h5", "global.npz", "points.npz"
+_OPTIONAL = "matches.h5", "global.npz"  # may be deleted
 
 
 class PhotoFile(Mapping[str, Image]):
@@ -102,7 +103,8 @@ def read_map(path: str | Path) -> Map:
 
 def _read_map(path: Path) -> Map:
     info, checksums = read_info(path)
-    check_files(path, checksums)
+    gone = {name for name in _OPTIONAL if not (path / name).exists()}
+    check_files(path, {name: one for name, one in checksums.items() if name not in gone})
     parts = {part.stem: part for part in path.iterdir() if part.name in _PARTS}
     model = read_model(path / "sparse")
     names = sorted(model.image(i).name for i in model.reg_image_ids())

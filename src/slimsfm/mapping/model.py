@@ -92,7 +92,9 @@ def _fault(model: pycolmap.Reconstruction) -> str | None:
 
 
 def _camera_fault(model: pycolmap.Reconstruction) -> str | None:
-    for camera_id, camera in sorted(model.cameras.items()):
+    used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+    for camera_id in sorted(used):
+        camera = model.camera(camera_id)
         if camera.is_spherical():
             return (
                 f"camera {camera_id} is spherical ({camera.model_name}), which is not supported; cut its "

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.errors import ReconstructionError
 from slimsfm.files import working_folder
+from slimsfm.lenses import camera_fault
 from slimsfm.progress import ProgressBar, counted, silent, single_step
 
 # COLMAP cannot read the photos, because its database names them by numbers; we color points ourselves. After
@@ -21,6 +22,7 @@ _EXPECTED_WARNINGS = re.compile(
     r"Could not read image|Requested to use GPU|Discarding reconstruction|Less than 50% of cameras have prior"
 )
 _LOGGER = logging.getLogger(__name__)
+_FEWEST = 3  # images of a model
 
 
 @contextmanager
@@ -79,7 +81,7 @@ def map_incrementally(
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     options.extract_colors = False
-    options.min_model_size = 3
+    options.min_model_size = _FEWEST
     pycolmap.set_random_seed(seed)
     registered = 0  # in the model under way; the progress is that of the largest model
 
@@ -136,7 +138,16 @@ def _scratch() -> Iterator[Path]:
 def _named(models: Mapping[int, pycolmap.Reconstruction], names: list[str]) -> list[pycolmap.Reconstruction]:
     for model in models.values():
         _name_images(model, names)
-    return [model for _, model in sorted(models.items())]
+        drop_impossible(model)
+    return [model for _, model in sorted(models.items()) if model.num_reg_images() >= _FEWEST]
+
+
+def drop_impossible(model: pycolmap.Reconstruction) -> None:
+    """Leave out images whose camera came out as no lens is: one camera must not cost the whole model."""
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        if camera_fault(model.camera(image.camera_id)):
+            model.deregister_frame(image.frame_id)
 
 
 def _numbered(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
