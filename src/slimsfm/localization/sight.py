@@ -34,10 +34,10 @@ class Sight:
             points3D_in_world: The points of the matches that it was estimated from.
             camera: The intrinsics that it was estimated with or that were estimated with it.
         """
-        if not pose.is_possible(points3D_in_world) or (pose.camera and camera_fault(pose.camera)):
+        in_cam = pose.cam_from_world * points3D_in_world[pose.inliers]
+        if not pose.is_finite or in_cam[:, 2].min() <= 0 or (pose.camera and camera_fault(pose.camera)):
             return False
-        scale = _scale(points3D_in_world[pose.inliers], pose.cam_from_world, camera)
-        return self._smallest <= scale <= self._largest
+        return self._smallest <= _scale(in_cam, camera) <= self._largest
 
 
 def _scales(map: Map) -> Iterator[float]:
@@ -45,7 +45,7 @@ def _scales(map: Map) -> Iterator[float]:
         seen = _seen(map, name)
         if len(seen):
             points, camera = map.points3D_in_world[seen], map.camera(name)
-            yield _scale(points, image.cam_from_world(), camera) / map.shrink_factor(name)
+            yield _scale(image.cam_from_world() * points, camera) / map.shrink_factor(name)
 
 
 def _seen(map: Map, name: str) -> Ids:
@@ -57,7 +57,8 @@ def _seen(map: Map, name: str) -> Ids:
     return np.flatnonzero(np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=1))
 
 
-def _scale(points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> float:
+def _scale(points3D_in_cam: Points3D, camera: pycolmap.Camera) -> float:
     """Pixels per map unit at the points of median distance."""
-    distances = np.linalg.norm(cam_from_world * points3D_in_world, axis=1)
-    return float(camera.mean_focal_length() / max(np.median(distances), np.finfo(np.float64).tiny))
+    squares, middle = np.einsum("nd,nd->n", points3D_in_cam, points3D_in_cam), len(points3D_in_cam) // 2
+    distance = np.sqrt(np.partition(squares, middle)[middle])
+    return float(camera.mean_focal_length() / max(distance, np.finfo(np.float64).tiny))

@@ -52,6 +52,7 @@ UNAMBIGUOUS = 0.75
 """Share of distinct inliers from which a pose is unambiguous."""
 
 _DOUBTED = 0.6  # of the confidence, next to contradicted images
+_DETERMINED = 0.02  # predicted error up to which one of 0.1 would be five standard deviations
 _VAGUE = 0.5  # most, where the predicted error is above that of a right pose
 _BEHIND = 0.02  # of the confidence, where most points are seen from behind: a mirrored photo of a plane is
 _LEAST_FACING = 0.5  # share of the points that must be seen from the side they were seen from
@@ -188,12 +189,12 @@ class Verifier:
             camera: The query's intrinsics.
         """
         agreeing, points = matches.keypoints[pose.inliers], matches.points[pose.inliers]
-        others = ~pose.inliers
+        others, predicted_error = ~pose.inliers, pose.predicted_corner_error(self._box)
         return Evidence(
             inliers=_count(agreeing),
             distinct=_count(agreeing[self._distinct[points]]),
             matched=_count(matches.keypoints),
-            predicted_error=pose.predicted_corner_error(self._box),
+            predicted_error=predicted_error,
             rival=self._rival(matches, matches.pixels(query), others, pose, camera),
             found=self._found(query, points, pose, camera),
             uncalibrated_error=self._uncalibrated_error(pose),
@@ -201,8 +202,11 @@ class Verifier:
             cells=_cells(matches.pixels(query)[pose.inliers], camera),
             facing=self._facing(points, pose),
             doubted=self._doubted(pose),
-            determined=pose.probability_within(ADD_FRACTIONS[0] * inflation(pose.estimated), self._box),
+            determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
         )
+
+    def _determined(self, pose: PoseEstimate) -> float:
+        return pose.probability_within(ADD_FRACTIONS[0] * inflation(pose.estimated), self._box)
 
     def _facing(self, points: Ids, pose: PoseEstimate) -> float:
         """Share of points that are seen from the side from which the references saw them."""
