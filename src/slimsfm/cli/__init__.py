@@ -168,10 +168,11 @@ def _execute(name: str, arguments: Sequence[str]) -> None:
         return
     call = parse(command, name, arguments)
     _take_signal_back()
-    from slimsfm.cli.output import quiet
+    from slimsfm.cli.output import name_flags_in_warnings, quiet
     from slimsfm.files import remove_abandoned
 
     remove_abandoned()
+    name_flags_in_warnings()
     with quiet():
         call()
 

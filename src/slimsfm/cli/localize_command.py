@@ -7,6 +7,7 @@ from typing import Annotated
 from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, ImagesPath, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
+from slimsfm.cli.parsing import with_flags
 from slimsfm.errors import InputError
 from slimsfm.image_files import find_images
 from slimsfm.localization import (
@@ -141,7 +142,7 @@ def _print(by_object: Mapping[str, Mapping[str, Localization]], again: Collectio
 
 def _outcome(one: Localization) -> str:
     if one.pose is None:
-        return f"{'skipped' if one.is_skipped else 'not localized'}: {one.reason}"
+        return f"{'skipped' if one.is_skipped else 'not localized'}: {with_flags(one.reason or '')}"
     inliers = f"{one.pose.num_inliers} inliers of {one.num_matches} matches"
     return f"{inliers}, confidence {one.pose.confidence:.2f}{_estimated(one)}"
 

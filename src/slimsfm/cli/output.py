@@ -1,5 +1,6 @@
 """What the commands share in checking outputs and printing."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,17 @@ def check_output(output: Path, *sources: Path | None, overwrite: bool, least_byt
             raise OutputError(f"{output}: is or contains the input {source}; choose another output")
     check_writable(output, overwrite=overwrite)
     check_place(output, least_bytes=least_bytes)
+
+
+class _WithFlags(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return with_flags(super().format(record))
+
+
+def name_flags_in_warnings() -> None:
+    """Name options as flags in warnings of the library, which Python prints on standard error."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_WithFlags())
 
 
 @contextmanager
