@@ -105,7 +105,7 @@ def resized_camera(camera: pycolmap.Camera, factor: float | int) -> pycolmap.Cam
     resized, params = copy(camera), camera.params.copy()
     params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] *= factor
     resized.params = params.tolist()
-    resized.width, resized.height = round(camera.width * factor), round(camera.height * factor)
+    resized.width, resized.height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
     return resized
 
 

@@ -137,6 +137,14 @@ def run(arguments: Sequence[str]) -> int:
 
         print(f"slimsfm: {printable(with_flags(str(error)))}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # such as a name that is too long, or a circle of links
+        print(
+            f"slimsfm: {error.filename or 'a file'}: cannot be used ({error.strerror or error})",
+            file=sys.stderr,
+        )
+        return EXIT_BAD_INPUT
     except KeyboardInterrupt as interruption:
         outcome = str(interruption) or "no incomplete output was left behind"
         print(f"slimsfm: interrupted; {outcome}", file=sys.stderr)
@@ -168,11 +176,11 @@ def _execute(name: str, arguments: Sequence[str]) -> None:
         return
     call = parse(command, name, arguments)
     _take_signal_back()
-    from slimsfm.cli.output import name_flags_in_warnings, quiet
+    from slimsfm.cli.output import quiet, tidy_warnings
     from slimsfm.files import remove_abandoned
 
     remove_abandoned()
-    name_flags_in_warnings()
+    tidy_warnings()
     with quiet():
         call()
 

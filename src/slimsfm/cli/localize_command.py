@@ -1,5 +1,6 @@
 """`slimsfm localize`."""
 
+import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated
@@ -103,7 +104,7 @@ def _check_options(workers: int | None, also: Collection[Path], **of_one_map: Pa
 
 def _named(*paths: Path) -> dict[str, Path]:
     """Map paths by their last part, or by the whole path where these parts are equal."""
-    last = [path.resolve().name for path in paths]
+    last = [Path(os.path.realpath(path)).name for path in paths]
     names = last if len(set(last)) == len(last) else [str(path) for path in paths]
     if len(set(names)) < len(names):
         raise InputError(f"also: the map {max(names, key=names.count)} is given twice")

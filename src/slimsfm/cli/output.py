@@ -1,6 +1,8 @@
 """What the commands share in checking outputs and printing."""
 
 import logging
+import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,11 +41,16 @@ def check_output(output: Path, *sources: Path | None, overwrite: bool, least_byt
 
     Raises:
         OutputError: The output exists and `overwrite` is off, it cannot be created, there is no room for
-            `least_bytes`, or it is or contains a source.
+            `least_bytes`, or it is or contains a source, or lies in a map that is one.
     """
     for source in sources:
-        if source is not None and source.resolve().is_relative_to(output.resolve()):
+        if source is None:
+            continue
+        written, read = (Path(os.path.realpath(path)) for path in (output, source))
+        if read.is_relative_to(written):
             raise OutputError(f"{output}: is or contains the input {source}; choose another output")
+        if written.is_relative_to(read) and (read / "map.json").is_file():
+            raise OutputError(f"{output}: lies in the map {source}; choose another output")
     check_writable(output, overwrite=overwrite)
     check_place(output, least_bytes=least_bytes)
 
@@ -53,8 +60,9 @@ class _WithFlags(logging.Formatter):
         return with_flags(super().format(record))
 
 
-def name_flags_in_warnings() -> None:
-    """Name options as flags in warnings of the library, which Python prints on standard error."""
+def tidy_warnings() -> None:
+    """Name options as flags in warnings of the library, and hide those of Pillow on damaged EXIF data."""
+    warnings.filterwarnings("ignore", module="PIL")
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_WithFlags())
 

@@ -278,5 +278,5 @@ def _pair_of(group: str, by_key: Mapping[str, str]) -> tuple[str, str] | None:
         splits = [group.split("/", 1)]
     else:
         splits = [(group[:i], group[i + 1 :]) for i, letter in enumerate(group) if letter == "_"]
-    found = [(by_key[a], by_key[b]) for a, b in splits if a in by_key and b in by_key]
+    found = [(by_key[a], by_key[b]) for a, b in splits if a in by_key and b in by_key and a != b]
     return found[0] if len(found) == 1 else None

@@ -163,6 +163,8 @@ def opened(path: Path) -> h5py.File:
     Raises:
         InputError: The file is missing or damaged.
     """
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is not a file")
     try:
         return h5py.File(path, "r")
     except FileNotFoundError as error:

@@ -13,6 +13,9 @@ from slimsfm.files.working_folders import working_folder
 RESUME = "run the same command again to resume"
 """What to say when work was interrupted that can be resumed."""
 
+KEY_FILE = "build.json"
+"""The file that says what the work is of; the first that is written."""
+
 _TRIES = 5
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -58,6 +61,8 @@ def resumable_folder(output: str | Path) -> Iterator[Path]:
 def _claim(folder: Path, opened: ExitStack, output: Path) -> bool:
     """Make and lock a folder until `opened` closes; False if its file system has no locks."""
     for _ in range(_TRIES):
+        if _is_foreign(folder):
+            raise OutputError(f"{folder}: is in the way and not what a build left there; rename or remove it")
         folder.mkdir(parents=True, exist_ok=True)
         held = opened.enter_context(locked(folder))
         if held is False:
@@ -67,6 +72,14 @@ def _claim(folder: Path, opened: ExitStack, output: Path) -> bool:
         if held or folder.exists():  # else its last user has removed it in the meantime
             return bool(held)
     return False
+
+
+def _is_foreign(folder: Path) -> bool:
+    """Whether there is something else: a link, a file, or a folder without the key of a build."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        return True
+    names = [path.name for path in folder.iterdir()] if folder.exists() else []
+    return bool(names) and not any(name.startswith(Path(KEY_FILE).stem) for name in names)
 
 
 def _holds_work(folder: Path) -> bool:

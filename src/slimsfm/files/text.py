@@ -1,10 +1,11 @@
 """Text and JSON files, read whole and within limits. Damage raises many errors: see `contents_of`."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
-from slimsfm.limits import check_bytes
+from slimsfm.limits import check_bytes, current_limits
 
 
 def read_bytes(path: Path) -> bytes:
@@ -14,8 +15,11 @@ def read_bytes(path: Path) -> bytes:
         InputError: The file is larger than the limit.
         OSError: It is missing or unreadable.
     """
-    check_bytes(path, path.stat().st_size)
-    return path.read_bytes()
+    with path.open("rb") as file:
+        check_bytes(path, os.fstat(file.fileno()).st_size)
+        found = file.read(1 + int(current_limits().max_file_gb * 1e9))  # a device or a pipe states no size
+    check_bytes(path, len(found))
+    return found
 
 
 def read_text(path: Path) -> str:

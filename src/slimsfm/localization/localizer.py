@@ -272,9 +272,13 @@ class Localizer:
             given: Intrinsics to use.
 
         Raises:
-            ValueError: The given camera has another image size, or the focal length must be known but none is
-                given and the map's does not fit.
+            ValueError: The image is not RGB of eight bits, the given camera has another image size, or the focal
+                length must be known but none is given and the map's does not fit.
         """
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+            raise ValueError(
+                f"image must be RGB, uint8 of shape (height, width, 3), got {image.dtype} of {image.shape}"
+            )
         height, width = image.shape[:2]
         if isinstance(given, QueryCamera):
             camera_in_memory(self.map, width, height, given.camera)  # checks the size

@@ -7,6 +7,7 @@ from slimsfm.geometry import Box
 
 _FARTHEST = 1e15  # units from the origin: beyond, differences are lost, and later squares overflow
 _SMALLEST = 1e-12  # extent, in units and over the distance from the origin
+_FARTHEST_BOX = 1e3  # from the points, over the sizes of both
 _MOST_UNLIKE = 1e6  # ratio of the sizes of box and map
 
 
@@ -34,6 +35,9 @@ def box_fault(box: Box, points3D_in_world: Points3D) -> str | None:
         return fault
     center = np.median(points3D_in_world, axis=0)
     size = float(np.median(np.linalg.norm(points3D_in_world - center, axis=1)))
+    away = float(np.linalg.norm(box.center - center))
+    if away > _FARTHEST_BOX * max(size, box.diagonal):
+        return f"its box is {away:g} units from its points, which are about {size:g} from their center"
     if size / _MOST_UNLIKE <= box.diagonal and (size <= 0 or box.diagonal <= size * _MOST_UNLIKE):
         return None
     return f"its box has a diagonal of {box.diagonal:g}, but the points are about {size:g} from their center"

@@ -1,6 +1,7 @@
 """What a map says of itself, on disk: `map.json`, with checksums of itself and of the map's other files."""
 
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,7 +73,7 @@ def read_info(path: Path) -> StoredInfo:
         MapError: The folder has none, or it is damaged or of a later version.
     """
     file = path / _NAME
-    if not file.is_file():
+    if not os.path.isfile(file):  # Path.is_file raises errors for names that are too long
         raise MapError(f"{path}: not a map (it has no map.json); build or import one")
     try:
         with contents_of(file, "damaged", "build or import the map again"):

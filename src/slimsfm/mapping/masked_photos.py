@@ -7,6 +7,7 @@ that only fits the photo turned the other way is turned with it. Transparent pix
 features either, unless they are told to.
 """
 
+import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -40,7 +41,7 @@ def find_photos(folder: Path, masks: Path | None) -> FoundImages:
     Raises:
         InputError: As in `find_images`.
     """
-    inside = masks is not None and Path(masks).resolve() != folder.resolve()
+    inside = masks is not None and os.path.realpath(masks) != os.path.realpath(folder)
     return find_images(folder, leave_out=masks if inside else None)
 
 
@@ -136,7 +137,7 @@ class MaskedPhotos:
     def _find(self, masks: Path) -> None:
         if not masks.is_dir():
             raise InputError(f"{masks}: no such folder of masks")
-        if masks.resolve() == self._folder.resolve():
+        if os.path.realpath(masks) == os.path.realpath(self._folder):
             raise InputError(
                 f"{masks}: is the folder of the photos; put the masks into a folder of their own"
             )

@@ -1,5 +1,6 @@
 """What a model is built from, and what building it gives."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
@@ -115,7 +116,7 @@ def build_key(
     later = ("box", "model", "strict", "masks")  # masks count as files
     return {
         "versions": [version("slimsfm"), pycolmap.__version__, cv2.__version__],
-        "images": [str(images.resolve()), *names],
+        "images": [os.path.realpath(images), *names],
         "files": [[str(path), *_stamp(path)] for path in files],
         "extractor": [extractor.name, repr(extractor.options)],
         "networks": _networks(options),

@@ -22,12 +22,13 @@ from typing import Any
 import numpy as np
 
 from slimsfm.files import remove
+from slimsfm.files.resumable import KEY_FILE
 from slimsfm.progress import ProgressBar
 
 Array = np.ndarray
 
 FEATURES, DATABASE, SFM = "features.h5", "database.db", "sfm"
-_KEY, _EXTRACTED, _MATCHED, _IMAGES = "build.json", "extracted", "matched", "database.images"
+_EXTRACTED, _MATCHED, _IMAGES = "extracted", "matched", "database.images"
 _BLOCK = 20  # pairs of a file of matches
 _LATEST = (FEATURES, DATABASE, f"{DATABASE}-shm", f"{DATABASE}-wal", _EXTRACTED, _MATCHED, _IMAGES)
 
@@ -43,7 +44,7 @@ class Workspace:
             key: All that features and matches depend on, as JSON values.
         """
         self.folder = folder
-        text, path = json.dumps(key, sort_keys=True), folder / _KEY
+        text, path = json.dumps(key, sort_keys=True), folder / KEY_FILE
         if not path.is_file() or path.read_text() != text:
             for name in _LATEST:
                 remove(folder / name)

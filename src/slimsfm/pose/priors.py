@@ -248,4 +248,5 @@ def _grid(low: float, high: float, expected: float) -> Float64[np.ndarray, " k"]
 
 
 def _unit(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-    return direction / np.linalg.norm(direction)
+    scaled = direction / np.abs(direction).max()  # squares of tiny numbers are zero
+    return scaled / np.linalg.norm(scaled)

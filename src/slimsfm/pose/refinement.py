@@ -230,7 +230,7 @@ def _minimize(problem: _Problem, fit: _Fit) -> _Fit:
     information, gradient = problem.information_and_gradient(fit)
     for _ in range(_STEPS):
         step = _solve(information, gradient, damping)
-        if -gradient @ step < _NEGLIGIBLE:
+        if not -gradient @ step >= _NEGLIGIBLE:  # nor for a step that is no number
             break
         moved = fit.moved(step)
         moved_cost = problem.cost(moved)

@@ -101,6 +101,8 @@ def film_pictures(
         if last is None or shape is None:
             raise InputError(f"{path}: no frame can be decoded; the file is damaged")
         _check_end(path, index, last, _stated_end(container, stream))
+        if container.format.name == "avi" and stream.frames > index + 1:  # it states frames, no times
+            raise VideoError(f"{path}: is cut off after frame {index} of {stream.frames}")
 
 
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[Decoded]:
