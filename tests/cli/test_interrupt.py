@@ -64,7 +64,7 @@ def wait_until(process, begun):
     while not begun():
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
-        time.sleep(0.005)
+        time.sleep(0.001)
 
 
 def wait_until_localizing(process, a_map):

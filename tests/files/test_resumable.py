@@ -5,10 +5,11 @@ import errno
 import pytest
 
 from slimsfm.errors import InputError, OutputError
-from slimsfm.files.resumable import RESUME, resumable_folder
+from slimsfm.files.resumable import KEY_FILE, RESUME, resumable_folder
 
 
 def begin(folder):
+    (folder / KEY_FILE).write_text("{}")
     (folder / "part").mkdir()
     (folder / "part" / "done").write_bytes(b"")
 
@@ -57,3 +58,19 @@ def test_a_full_disk_is_an_error_of_the_output(tmp_path):
     with pytest.raises(OutputError, match=r"map: cannot be written"):
         work(tmp_path / "map", OSError(errno.ENOSPC, "No space left on device"))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("what", ["link", "file", "folder"])
+def test_what_no_build_left_is_kept_and_named(tmp_path, what):
+    foreign, mine = tmp_path / ".map.build", tmp_path / "mine"
+    mine.mkdir()
+    (mine / "photo").write_bytes(b"")
+    if what == "link":
+        foreign.symlink_to(mine)
+    elif what == "file":
+        foreign.write_bytes(b"")
+    else:
+        mine.rename(foreign)
+    with pytest.raises(OutputError, match=r"\.map\.build: is in the way"):
+        resumable_folder(tmp_path / "map").__enter__()
+    assert foreign.is_file() or (foreign / "photo").exists()

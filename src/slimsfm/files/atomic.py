@@ -119,6 +119,8 @@ def read_unchanged(folder: Path, read: Callable[[], T]) -> T:
     Raises:
         InputError: The folder was replaced again and again.
     """
+    if not os.path.exists(folder):  # not even under a name that can be
+        return read()
     for _ in range(_TRIES):
         before = identity(folder)
         with locked(folder, shared=True, wait_s=_PATIENCE_S):

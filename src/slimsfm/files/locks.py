@@ -23,10 +23,10 @@ class Identity(NamedTuple):
 
 
 def identity(path: Path) -> Identity | None:
-    """The identity of what is at a path; None if there is nothing, or nothing can be."""
+    """The identity of what is at a path; None if there is nothing."""
     try:
         found = path.stat()
-    except OSError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     return Identity(found.st_dev, found.st_ino)
 

@@ -272,8 +272,8 @@ class Localizer:
             given: Intrinsics to use.
 
         Raises:
-            ValueError: The image is not RGB of eight bits, the given camera has another image size, or the focal
-                length must be known but none is given and the map's does not fit.
+            ValueError: The image is not RGB of eight bits, the given camera has another image size, or the
+                focal length must be known but none is given and the map's does not fit.
         """
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
             raise ValueError(

@@ -22,7 +22,7 @@ measures the calibration on held-out scenes. A pose that sees the surface from b
 No confidence exceeds the probability, by the covariance of the pose, that its corner error is below 0.1 if
 all of its inliers are right. That is of the covariance before its inflation for the 95 % bounds, which most
 errors do not nearly reach; where the predicted error, which includes it, is above 0.1, the confidence is at
-most 0.5, so that the pose is never sure.
+most 0.9, so that the pose is never sure.
 
 This holds on right maps. Next to images that the map's own matches contradict, because the map may be folded
 there, 60 % of the confidence remains.
@@ -53,7 +53,7 @@ UNAMBIGUOUS = 0.75
 
 _DOUBTED = 0.6  # of the confidence, next to contradicted images
 _DETERMINED = 0.02  # predicted error up to which one of 0.1 would be five standard deviations
-_VAGUE = 0.5  # most, where the predicted error is above that of a right pose
+_VAGUE = 0.9  # most, where the predicted error is above that of a right pose
 _BEHIND = 0.02  # of the confidence, where most points are seen from behind: a mirrored photo of a plane is
 _LEAST_FACING = 0.5  # share of the points that must be seen from the side they were seen from
 _ONE_SIDED = 0.3  # length of a point's mean viewing direction from which it has a side
