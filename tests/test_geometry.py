@@ -13,6 +13,7 @@ from slimsfm.geometry import (
     corner_error,
     project,
     reprojection_errors,
+    resized_camera,
     rotation_error_deg,
     translation_error,
 )
@@ -150,3 +151,9 @@ def test_point_behind_the_camera_has_no_projection_and_an_infinite_error():
 
 def test_projecting_no_points_gives_no_pixels():
     assert project(np.zeros((0, 3)), pycolmap.Rigid3d(), camera()).shape == (0, 2)
+
+
+def test_a_resized_image_has_a_pixel_at_least():
+    thin = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 500.0, 100_000, 1)
+    small = resized_camera(thin, 0.01)
+    assert (small.width, small.height) == (1000, 1)

@@ -311,3 +311,23 @@ def test_an_image_whose_focal_length_must_be_known_but_is_not(refused, boulder, 
     Image.new("RGB", (240, 320)).save(upright)
     arguments = ("localize", boulder.map_path, upright, "-o", tmp_path / "poses.json", "--focal", "known")
     refused(*arguments, naming="--camera FILE")
+
+
+def test_no_output_lies_in_a_map_that_is_read(a_map, photos, tmp_path):
+    before = contents(tmp_path)
+    outcome = slimsfm("localize", a_map, photos, "-o", a_map / "map.json", "--overwrite")
+    assert outcome.code == 2
+    assert "map.json: lies in the map" in outcome.err
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["info", "localize"])
+@pytest.mark.parametrize("kind", ["circle", "long"])
+def test_paths_that_cannot_be_are_named(photos, tmp_path, command, kind):
+    path = tmp_path / ("x" * 300 if kind == "long" else "circle")
+    if kind == "circle":
+        path.symlink_to(path)
+    options = (photos, "-o", tmp_path / "poses.json") if command == "localize" else ()
+    outcome = slimsfm(command, path, *options)
+    assert outcome.code == 2
+    assert path.name in outcome.err

@@ -231,3 +231,11 @@ def test_a_pair_that_can_be_read_in_two_ways_is_no_pair(tmp_path):
         file["a_b_c/matches0"] = np.array([0])
     assert list(MatchFile(tmp_path / "matches.h5", ["a", "b_c"])) == [("a", "b_c")]
     assert list(MatchFile(tmp_path / "matches.h5", ["a", "b_c", "a_b", "c"])) == []
+
+
+def test_matches_of_an_image_with_itself_are_no_pair(tmp_path):
+    write_matches(tmp_path / "m.h5", {("a", "b"): np.array([[0, 1]])}, {"a": 3, "b": 3})
+    with h5py.File(tmp_path / "m.h5", "r+") as file:
+        file["a/a/matches0"] = np.zeros(3, np.int16)
+    found = MatchFile(tmp_path / "m.h5", ["a", "b"])
+    assert (list(found), found.num_other_pairs) == ([("a", "b")], 1)

@@ -1,3 +1,4 @@
+import os
 import time
 import zlib
 from contextlib import suppress
@@ -175,3 +176,10 @@ def test_names_of_datasets_are_found_in_any_depth(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["keypoints/a/keypoints"] = file["b"] = [1]
     assert sorted(datasets_of(opened(tmp_path / "a.h5"))) == ["b", "keypoints/a/keypoints"]
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_no_file_is_refused_without_waiting(tmp_path, make):
+    make(tmp_path / "a.h5")
+    with pytest.raises(InputError, match=r"a\.h5: is not a file"):
+        opened(tmp_path / "a.h5")

@@ -89,3 +89,8 @@ def test_a_resized_image_is_localized_with_the_scaled_camera(boulder):
     assert corner_error(found, map_.images[path.name].cam_from_world(), map_.box) < 0.01
     given = localizer.localize(large, scaled_camera(map_.shared_camera, 640, 480)).pose.cam_from_world
     assert np.array_equal(found.matrix(), given.matrix())
+
+
+def test_only_rgb_of_eight_bits_is_localized(exact):
+    with pytest.raises(ValueError, match="image must be RGB, uint8 of shape"):
+        Localizer(exact).camera_of(np.zeros((0, 640, 3), np.uint8))

@@ -178,3 +178,13 @@ def test_gravity_and_focal_length_are_used_together():
     assert next(errors) < next(errors)
     wrong = gravity_at(truth, 30.0)
     assert estimate_pose(pixels, points, given, gravity=wrong, focal=focal) is None
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-200, 1e300])
+def test_the_lengths_of_the_directions_do_not_matter(length):
+    down = np.array([0.0, 0.0, -1.0])
+    pixels, points, _ = matches(camera(), poses(1)[0])
+    in_cam = poses(1)[0].rotation.matrix() @ down
+    gravity = Gravity(in_world=length * down, in_cam=length * in_cam)
+    found = estimate_pose(pixels, points, camera(), gravity=gravity)
+    assert corner_error(found.cam_from_world, poses(1)[0], BOX) < 1e-3

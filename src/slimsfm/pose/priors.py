@@ -83,6 +83,7 @@ class Gravity:
         for name, direction in (("in_world", self.in_world), ("in_cam", self.in_cam)):
             if not np.all(np.isfinite(direction)) or not np.any(direction):
                 raise ValueError(f"{name} must be finite and not zero, got {direction.tolist()}")
+            object.__setattr__(self, name, direction / np.abs(direction).max())  # squares must be numbers
         if not 0 < self.uncertainty_deg < 90:
             raise ValueError(f"uncertainty_deg must be between 0 and 90, got {self.uncertainty_deg}")
 
@@ -248,5 +249,4 @@ def _grid(low: float, high: float, expected: float) -> Float64[np.ndarray, " k"]
 
 
 def _unit(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-    scaled = direction / np.abs(direction).max()  # squares of tiny numbers are zero
-    return scaled / np.linalg.norm(scaled)
+    return direction / np.linalg.norm(direction)
