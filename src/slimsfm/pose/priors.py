@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from slimsfm.geometry import motions
 
+_SHORTEST = 1e-100  # vector that is used as it is
 _USUAL = 1.2  # focal length over the longer side, as COLMAP guesses
 _TRIED = (0.23, 5.3)  # over the longer side: fields of view of 130 to 11 degrees
 _POSSIBLE = (0.1, 10.0)  # over the longer side: COLMAP also rejects photographs beyond these
@@ -83,7 +84,8 @@ class Gravity:
         for name, direction in (("in_world", self.in_world), ("in_cam", self.in_cam)):
             if not np.all(np.isfinite(direction)) or not np.any(direction):
                 raise ValueError(f"{name} must be finite and not zero, got {direction.tolist()}")
-            object.__setattr__(self, name, direction / np.abs(direction).max())  # squares must be numbers
+            if not _SHORTEST < np.abs(direction).max() < 1 / _SHORTEST:  # squares must be numbers
+                object.__setattr__(self, name, direction / np.abs(direction).max())
         if not 0 < self.uncertainty_deg < 90:
             raise ValueError(f"uncertainty_deg must be between 0 and 90, got {self.uncertainty_deg}")
 
