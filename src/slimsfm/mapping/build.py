@@ -1,6 +1,5 @@
 """Build maps from photos by Structure from Motion."""
 
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +10,7 @@ from slimsfm.devices import Device
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.exif import Exif, ignored_values, read_device, read_exif, read_orientation
 from slimsfm.features import Extractor, load_extractor
+from slimsfm.files import working_folder
 from slimsfm.geometry import Box
 from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
@@ -212,8 +212,8 @@ def _origins(quality: ModelQuality, work: BuildWork) -> dict[str, str]:
 def _opened(workspace: str | Path | None) -> Iterator[Path]:
     """The workspace, or a temporary one. The open file of features stays readable after it is removed."""
     if workspace is None:
-        with tempfile.TemporaryDirectory(prefix="slimsfm-build-") as folder:
-            yield Path(folder)
+        with working_folder() as folder:
+            yield folder
     else:
         Path(workspace).mkdir(parents=True, exist_ok=True)
         yield Path(workspace)

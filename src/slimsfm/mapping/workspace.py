@@ -14,10 +14,11 @@ A file appears under its name when it is complete, so that a process may be kill
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -105,10 +106,8 @@ def resumed(label: str, done: int) -> str:
 
 def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write arrays to a file that appears when it is complete."""
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
+    with _whole(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
-    os.replace(partial, path)
 
 
 def load_arrays(path: Path) -> dict[str, Array] | None:
@@ -122,8 +121,15 @@ def load_arrays(path: Path) -> dict[str, Array] | None:
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file that appears when it is complete."""
+    with _whole(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[BinaryIO]:
     partial = path.with_suffix(".partial")
-    partial.write_bytes(content)
+    with partial.open("wb") as file:
+        yield file
     os.replace(partial, path)
 
 
