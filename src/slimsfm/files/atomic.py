@@ -34,13 +34,19 @@ def check_writable(path: str | Path, *, overwrite: bool) -> None:
                 )
             if not path.is_file() and not path.is_dir():
                 raise OutputError(f"{path}: is neither a file nor a folder; choose another output")
-        parent = Path(os.path.realpath(path)).parent
-        while not parent.exists():
-            parent = parent.parent
+        parent = existing_parent(path)
     except OSError as error:
         raise _cannot_write(path, error) from error
     if not parent.is_dir():
         raise OutputError(f"{path}: {parent} is not a folder, so nothing can be written there")
+
+
+def existing_parent(path: Path) -> Path:
+    """What exists nearest above an output, through links: its folder, if that exists."""
+    parent = Path(os.path.realpath(path)).parent
+    while not parent.exists():
+        parent = parent.parent
+    return parent
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 
 from slimsfm.errors import OutputError
+from slimsfm.files.atomic import existing_parent
 
 _LEAST = 4096  # bytes of the smallest output, a block of most file systems
 
@@ -24,9 +25,7 @@ def check_place(path: str | Path, *, least_bytes: int = 0) -> None:
     """
     path = Path(path)
     try:
-        parent = path.absolute().parent
-        while not parent.exists():
-            parent = parent.parent
+        parent = existing_parent(path)
         with tempfile.NamedTemporaryFile(dir=parent, prefix=".slimsfm-"):
             pass
         usage = shutil.disk_usage(parent)
