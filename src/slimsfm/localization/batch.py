@@ -1,9 +1,7 @@
 """Localize images against several maps, and all images of a folder on several threads."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -11,9 +9,9 @@ import pycolmap
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.execution import map_on_threads, num_cores
-from slimsfm.features import Features
 from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import QueryCamera, query_camera
+from slimsfm.localization.extraction import ImageRounds
 from slimsfm.localization.localizer import Localizer
 from slimsfm.localization.outcome import Localization
 from slimsfm.localization.shared_cameras import corrected_cameras, share_cameras
@@ -63,18 +61,11 @@ class MultiLocalizer:
         Raises:
             ValueError: As in `Localizer.localize`.
         """
-        extracted: dict[str, Features] = {}
-        found = {}
-        for name, localizer in self.localizers.items():
-            camera = localizer.camera_of(image, (cameras or {}).get(name))
-            info, start = localizer.map.info, perf_counter()
-            key = repr((info.extractor, sorted(info.extractor_options.items())))
-            if key not in extracted:
-                extracted[key] = localizer.extractor.extract(image, mask)
-            seconds = perf_counter() - start
-            one = localizer.localize_features(extracted[key], camera, gravity)
-            found[name] = replace(one, seconds=replace(one.seconds, extract=seconds))
-        return found
+        rounds = ImageRounds(image, mask)
+        return {
+            name: localizer.localize_in_rounds(rounds, (cameras or {}).get(name), gravity)
+            for name, localizer in self.localizers.items()
+        }
 
 
 _ONLY = ""  # name of the object where there is one map

@@ -1,8 +1,10 @@
 """Localize a query image against one map."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
+from typing import get_args
 
 import numpy as np
 import pycolmap
@@ -16,12 +18,12 @@ from slimsfm.localization.cameras import (
     QueryCamera,
     camera_in_memory,
 )
+from slimsfm.localization.extraction import ExtractionChoice, ImageRounds, SizedExtractor
 from slimsfm.localization.matching import extract_near
 from slimsfm.localization.outcome import Localization, Seconds
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.descriptors import descriptor_length
-from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 from slimsfm.pose import Gravity, RansacOptions
 
@@ -57,6 +59,10 @@ class LocalizationOptions:
     together with the pose where it is not known or where the matches contradict it. known: as it is, without
     correction. approximate: to 30 %. unknown: not at all."""
 
+    extraction: ExtractionChoice = "rounds"
+    """Image that features of a query are extracted from: a small version of it first, and a larger one only
+    until the pose is sure and exact (rounds), or the whole one (whole)."""
+
     min_confidence: float = 0.5
     """Poses of lower confidence are discarded: the query counts as not localized."""
 
@@ -64,6 +70,10 @@ class LocalizationOptions:
         known = sorted({**STRATEGIES, **plugins("strategy")})
         if self.strategy not in ("auto", *known):
             raise ValueError(f"strategy must be auto or one of {', '.join(known)}, got {self.strategy!r}")
+        if self.extraction not in get_args(ExtractionChoice):
+            raise ValueError(
+                f"extraction must be one of {', '.join(get_args(ExtractionChoice))}, got {self.extraction!r}"
+            )
         if not 0 <= self.min_confidence <= 1:
             raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
 
@@ -116,7 +126,8 @@ class Localizer:
     def __init__(self, map: Map, options: LocalizationOptions = LocalizationOptions()) -> None:
         self.map = map
         self.options = options
-        self.extractor = extractor_of(map)
+        self._extractor = SizedExtractor(map)
+        self.extractor = self._extractor.whole
         self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
         self._length = descriptor_length(map)
         self._search = Search(map, self._strategy, options.ransac, options.focal)
@@ -141,11 +152,30 @@ class Localizer:
             ValueError: The camera has another image size or is impossible, or none is given and the map's
                 does not fit.
         """
+        return self.localize_in_rounds(ImageRounds(image, mask), camera, gravity)
+
+    def localize_in_rounds(
+        self,
+        rounds: ImageRounds,
+        camera: pycolmap.Camera | QueryCamera | None = None,
+        gravity: Gravity | None = None,
+    ) -> Localization:
+        """Localize one image like `localize`, by features that localizers of several maps share.
+
+        The time of an extraction counts for the localizer that is the first to need it.
+        """
+        image, before = rounds.image, rounds.seconds
         camera = self.camera_of(image, camera)
-        start = perf_counter()
-        features = self.extractor.extract(image, mask)
-        seconds, query = perf_counter() - start, self._query(features, camera.camera, image)
-        return self._localization(query, self._search.run(query, camera, gravity), camera, seconds)
+        sizes = self._extractor.sizes(image)
+        if self.options.extraction == "whole" or self.looks_at_images:
+            sizes = sizes[-1:]
+        levels = [partial(self._extracted_query, rounds, size, camera.camera) for size in sizes]
+        found = self._search.run(levels, camera, gravity)
+        return self._localization(found, camera, rounds.seconds - before)
+
+    def _extracted_query(self, rounds: ImageRounds, size: int, camera: pycolmap.Camera) -> Query:
+        found = rounds.at(self._extractor, size)
+        return self._query(found.features, camera, found.shrink_factor, rounds.image)
 
     def localize_near(
         self,
@@ -173,10 +203,10 @@ class Localizer:
         camera = self.camera_of(image, camera)
         start = perf_counter()
         found = extract_near(self.extractor, image, self.map.box, near_cam_from_world, camera.camera)
-        seconds, query = perf_counter() - start, self._query(found.features, camera.camera, image)
-        query = replace(query, shrink_factor=found.shrink_factor)
+        seconds = perf_counter() - start
+        query = self._query(found.features, camera.camera, found.shrink_factor, image)
         searched = self._search.near(query, camera, near_cam_from_world)
-        return self._localization(query, searched, camera, seconds)
+        return self._localization(searched, camera, seconds)
 
     @property
     def looks_at_images(self) -> bool:
@@ -202,22 +232,25 @@ class Localizer:
             ValueError: The camera is impossible.
         """
         camera = _given(camera)
-        query = self._query(features, camera.camera, image)
-        return self._localization(query, self._search.run(query, camera, gravity), camera, 0.0)
+        found = self._search.run([partial(self._whole_query, features, camera, image)], camera, gravity)
+        return self._localization(found, camera, 0.0)
 
     def search(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> SearchResult:
         """Localize an image by its features, with the evidence, and without a limit on the confidence."""
         camera = _given(camera)
-        return self._search.run(self._query(features, camera.camera), camera)
+        return self._search.run([partial(self._whole_query, features, camera)], camera)
 
     def rounds(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> Iterator[RoundResult]:
         """Run all rounds of the strategy, without stopping early."""
         camera = _given(camera)
-        return self._search.rounds(self._query(features, camera.camera), camera)
+        return self._search.rounds(self._whole_query(features, camera), camera)
 
-    def _localization(
-        self, query: Query, found: SearchResult, camera: QueryCamera, extract_seconds: float
-    ) -> Localization:
+    def _whole_query(self, features: Features, camera: QueryCamera, image: Image | None = None) -> Query:
+        width, height = camera.camera.width, camera.camera.height
+        factor = shrink_factor(self.extractor.options, width, height)
+        return self._query(features, camera.camera, factor, image)
+
+    def _localization(self, found: SearchResult, camera: QueryCamera, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
         reason = self._failure(found.best)
         if reason:
@@ -228,7 +261,7 @@ class Localizer:
             camera=found.best.camera,
             camera_source=camera.source,
             camera_notes=camera.notes,
-            points2D=matches.pixels(query),
+            points2D=matches.pixels(found.best.query),
             points3D_in_world=self.map.points3D_in_world[matches.points],
             references=found.references,
             predicted_corner_error=evidence and evidence.predicted_error,
@@ -245,7 +278,9 @@ class Localizer:
             return f"the confidence {best.confidence:.2f} is below {self.options.min_confidence:g}"
         return None
 
-    def _query(self, features: Features, camera: pycolmap.Camera, image: Image | None = None) -> Query:
+    def _query(
+        self, features: Features, camera: pycolmap.Camera, factor: float, image: Image | None
+    ) -> Query:
         length = features.descriptors.shape[1]
         if len(features) and self._length not in (None, length):
             raise MapError(
@@ -261,7 +296,7 @@ class Localizer:
             features=features,
             camera=camera,
             image=image,
-            shrink_factor=shrink_factor(self.extractor.options, camera.width, camera.height),
+            shrink_factor=factor,
         )
 
     def camera_of(self, image: Image, given: pycolmap.Camera | QueryCamera | None = None) -> QueryCamera:

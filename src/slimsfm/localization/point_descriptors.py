@@ -26,6 +26,7 @@ def mean_descriptors(map: Map) -> PointDescriptors:
         points=np.arange(len(map.point3D_ids), dtype=np.int64),
         descriptors=unit_rows(descriptor_sums(map)),
         directions=_directions(map),
+        sizes=_sizes(map),
     )
 
 
@@ -62,6 +63,34 @@ def viewing_directions(map: Map) -> Float32[np.ndarray, "points 3"]:
     directions = np.zeros((len(map.point3D_ids), 3), np.float32)
     directions[described.points] = described.directions
     return directions
+
+
+def point_sizes(map: Map) -> Float32[np.ndarray, "points"] | None:
+    """The stored size of each point's pattern, else the mean over its observations; None if unknown.
+
+    Infinite for single points that it is not known of.
+    """
+    described = map.point_descriptors
+    if map.features or described is None or described.sizes is None:
+        return _sizes(map)
+    sizes = np.full(len(map.point3D_ids), np.inf, np.float32)
+    sizes[described.points] = described.sizes
+    return sizes
+
+
+def _sizes(map: Map) -> Float32[np.ndarray, "points"] | None:
+    """Geometric mean of the sizes of the patterns that each point's keypoints describe."""
+    sums, counts = np.zeros(len(map.point3D_ids)), np.zeros(len(map.point3D_ids))
+    for name, seen in map.observations.items():
+        frames = map.features[name].frames if name in map.features else None
+        if frames is None:
+            return None
+        depths = (map.images[name].cam_from_world() * map.points3D_in_world[seen.points])[:, 2]
+        sizes = frames[seen.rows, 0] * depths / map.camera(name).mean_focal_length()
+        np.add.at(sums, seen.points, np.log(np.maximum(sizes, np.finfo(np.float32).tiny)))
+        np.add.at(counts, seen.points, 1)
+    known = np.exp(sums / np.maximum(counts, 1)).astype(np.float32)
+    return np.where(counts > 0, known, np.float32(np.inf))
 
 
 def _directions(map: Map) -> Float32[np.ndarray, "points 3"]:

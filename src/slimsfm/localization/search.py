@@ -1,7 +1,8 @@
 """Match a query in rounds until its pose is sure and accurate, or nothing is left to try."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from time import perf_counter
 from typing import NamedTuple
 
@@ -36,6 +37,10 @@ SETTLED = 0.8
 TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
 
+FeatureLevel = Callable[[], Query]
+"""Extracts the features of a query at one size of the image."""
+
+_COARSE_ROUNDS = 4  # of matching, with features of a shrunken image
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 
@@ -44,8 +49,11 @@ _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 class RoundResult:
     """Result of one round."""
 
+    query: Query
+    """The features that were matched."""
+
     matches: PointMatches
-    """All matches so far."""
+    """All matches of these features so far."""
 
     pose: PoseEstimate | None
     """The pose estimated from them, with its confidence."""
@@ -98,24 +106,33 @@ class Search:
         self._verifier = Verifier(map, strategy, distinct_points(map))
         self._sight = Sight(map)
 
-    def run(self, query: Query, camera: QueryCamera, gravity: Gravity | None = None) -> SearchResult:
-        """Localize a query; stop at the first round that suffices."""
+    def run(
+        self, levels: Sequence[FeatureLevel], camera: QueryCamera, gravity: Gravity | None = None
+    ) -> SearchResult:
+        """Localize a query by its features, from coarse to fine; stop at the first round that suffices."""
         rounds: list[RoundResult] = []
-        for one in self.rounds(query, camera, gravity):
+        for query in levels[:-1]:
+            for one in islice(self.rounds(query(), camera, gravity), _COARSE_ROUNDS):
+                rounds.append(one)
+                if suffices(rounds, is_coarse=True) and not needs_refuting(one):
+                    return _summed(rounds)
+            if rounds and suffices(rounds, is_coarse=True):  # larger images show no other references
+                return _summed(rounds)
+        for one in self.rounds(levels[-1](), camera, gravity):
             rounds.append(one)
-            if suffices(rounds):
+            if suffices(rounds) and not needs_refuting(one):
                 return _summed(rounds)
         is_sure = rounds and rounds[-1].confidence >= SURE
         if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
-            rounds.append(self._with_any_focal_length(query, rounds[-1], camera, gravity))
+            rounds.append(self._with_any_focal_length(rounds[-1], camera, gravity))
         return _summed(rounds)
 
     def _with_any_focal_length(
-        self, query: Query, last: RoundResult, camera: QueryCamera, gravity: Gravity | None
+        self, last: RoundResult, camera: QueryCamera, gravity: Gravity | None
     ) -> RoundResult:
         """The last round again, as if nobody knew the focal length; the round itself if that is no better."""
         unknown = replace(camera, source="unknown")
-        again = self._result(query, last.matches, unknown, perf_counter(), gravity)
+        again = self._result(last.query, last.matches, unknown, perf_counter(), gravity)
         inliers = [one.pose.num_inliers if one.pose else 0 for one in (last, again)]
         is_better = inliers[1] > _MORE * inliers[0] and again.confidence > last.confidence
         return again if is_better else replace(last, match_seconds=0.0, pose_seconds=again.pose_seconds)
@@ -166,6 +183,7 @@ class Search:
                 estimated = shrunk.enlarged(pose.camera)
             pose = replace(pose, confidence=evidence.confidence, camera=pose.camera and estimated)
         return RoundResult(
+            query=query,
             matches=matches,
             pose=pose,
             camera=estimated,
@@ -240,19 +258,27 @@ class _Shrunk(NamedTuple):
         return enlarged
 
 
-def suffices(rounds: list[RoundResult]) -> bool:
+def suffices(rounds: list[RoundResult], *, is_coarse: bool = False) -> bool:
     """Whether the last pose is sure, and not improving much, or accurate by inliers all over the object.
 
     Inliers in one corner may agree with each other more exactly than with the rest, as repeated texture does.
+
+    Args:
+        rounds: The rounds so far.
+        is_coarse: Whether features of a larger image are the alternative.
     """
     last = rounds[-1].evidence
-    if last is None or last.confidence < SURE:
-        return False
-    if last.is_ambiguous and rounds[-1].matches.references < MIN_REFUTING:
+    if last is None or (last.confidence_in_matches if is_coarse else last.confidence) < SURE:
         return False
     before = rounds[-2].evidence if len(rounds) > 1 else None
     settled = before is not None and last.predicted_error > SETTLED * before.predicted_error
     return settled or (last.predicted_error <= ACCURATE and last.cells >= SPREAD)
+
+
+def needs_refuting(last: RoundResult) -> bool:
+    """Whether a pose is ambiguous and more images could contradict it."""
+    is_ambiguous = last.evidence is not None and last.evidence.is_ambiguous
+    return is_ambiguous and last.matches.references < MIN_REFUTING
 
 
 def _summed(rounds: list[RoundResult]) -> SearchResult:

@@ -36,7 +36,7 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
-from slimsfm.localization.point_descriptors import viewing_directions
+from slimsfm.localization.point_descriptors import point_sizes, viewing_directions
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -53,6 +53,7 @@ UNAMBIGUOUS = 0.75
 
 _DOUBTED = 0.6  # of the confidence, next to contradicted images
 _DETERMINED = 0.02  # predicted error up to which one of 0.1 would be five standard deviations
+_UNPROVEN = 0.1  # largest corner error by wrong intrinsics that counts against the matches themselves
 _VAGUE = 0.9  # most, where the predicted error is above that of a right pose
 _BEHIND = 0.02  # of the confidence, where most points are seen from behind: a mirrored photo of a plane is
 _LEAST_FACING = 0.5  # share of the points that must be seen from the side they were seen from
@@ -62,6 +63,7 @@ _NEAREST = 3  # images that are next to a pose
 _CHECKED = 100  # visible points to look for
 _STRONGEST = 2048  # keypoints to look among
 _NEAR_PX, _FAR_PX = 5.0, 15.0  # distance from the projection of a point: at most there, at least elsewhere
+_LEAST_SCALE_PX = 1.2  # of a keypoint that detectors find reliably
 _MAX_RATIO = 0.9  # angle to the descriptor there over angle to the best one elsewhere
 
 
@@ -128,6 +130,15 @@ class Evidence:
         return on_right_map * (_DOUBTED if self.doubted else 1.0)
 
     @property
+    def confidence_in_matches(self) -> float:
+        """The confidence, where it is low only because matches like these cannot prove the intrinsics.
+
+        Features of a larger image would hardly change that.
+        """
+        provable = min(self.uncalibrated_error, _UNPROVEN)
+        return replace(self, uncalibrated_error=provable).confidence
+
+    @property
     def is_behind(self) -> bool:
         """Whether the pose sees the surface from behind, as that of a mirrored photo of a plane does."""
         return self.facing < _LEAST_FACING
@@ -175,6 +186,7 @@ class Verifier:
         self._distinct = distinct
         self._doubtful = _doubtful_images(map)
         self._directions = viewing_directions(map)
+        self._sizes = point_sizes(map)
         self._centers = np.array([image.projection_center() for image in map.images.values()])
 
     def evidence(
@@ -247,11 +259,19 @@ class Verifier:
         descriptors, points = self._strategy.visible_points(pose.cam_from_world, agreeing)
         pixels = project(self._points3D_in_world[points], pose.cam_from_world, camera)
         inside = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=1)
-        visible = np.flatnonzero(inside)
+        visible = np.flatnonzero(inside & self._large_enough(points, pose, camera))
         if not len(visible):
             return 0.0
         visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
         return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
+
+
+    def _large_enough(self, points: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> Mask:
+        """Which points are so near that a detector finds them in the image."""
+        if self._sizes is None:
+            return np.ones(len(points), bool)
+        depths = (pose.cam_from_world * self._points3D_in_world[points])[:, 2]
+        return camera.mean_focal_length() * self._sizes[points] >= _LEAST_SCALE_PX * depths
 
 
 def _doubtful_images(map: Map) -> Mask:

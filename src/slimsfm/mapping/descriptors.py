@@ -23,6 +23,7 @@ from slimsfm.mapping.map import GlobalDescriptors, Map, PointDescriptors
 
 _LEVELS = 15
 _SAMPLE = 500  # descriptors per image that the vocabulary is learned from
+_LOG2_LIMITS = -100, 100  # of a size, so that its square is a number too
 _INT8_MAX = np.iinfo(np.int8).max
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 0, "pb": 0}]  # half bytes lack context
 
@@ -97,6 +98,8 @@ def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
         arrays["directions"] = np.round(_INT8_MAX * points.directions).astype(np.int8)
     if points.distinct is not None:
         arrays["distinct"] = np.packbits(points.distinct)
+    if points.sizes is not None:
+        arrays["log2_sizes"] = np.clip(np.log2(points.sizes), *_LOG2_LIMITS).astype(np.float16)
     with path.open("wb") as file:
         np.savez(file, **arrays)
 
@@ -119,6 +122,7 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
             descriptors=unpack(arrays, len(points)),
             directions=_unpack_directions(arrays, len(points)) if "directions" in arrays else None,
             distinct=_unpack_bits(arrays["distinct"], len(points)) if "distinct" in arrays else None,
+            sizes=_unpack_sizes(arrays["log2_sizes"], len(points)) if "log2_sizes" in arrays else None,
         )
 
 
@@ -127,6 +131,12 @@ def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[
     if stored.shape != (count, 3) or stored.dtype != np.int8:
         raise ValueError(f"directions of shape {stored.shape} and type {stored.dtype} for {count} points")
     return stored.astype(np.float32) / _INT8_MAX
+
+
+def _unpack_sizes(stored: np.ndarray, count: int) -> Float32[np.ndarray, " n"]:
+    if stored.shape != (count,) or stored.dtype != np.float16 or not np.isfinite(stored).all():
+        raise ValueError(f"sizes of shape {stored.shape} and type {stored.dtype} for {count} points")
+    return np.exp2(np.clip(stored.astype(np.float32), *_LOG2_LIMITS))
 
 
 def _unpack_bits(packed: UInt8[np.ndarray, " bytes"], count: int) -> Mask:

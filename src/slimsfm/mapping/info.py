@@ -10,6 +10,9 @@ from slimsfm.geometry import Box
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation
 
+SMALLEST_FIRST_SIZE = 64
+"""Least value of `MapInfo.first_image_size`: smaller images show hardly any features."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapInfo:
@@ -54,9 +57,16 @@ class MapInfo:
     """What EXIF says of the photos that a camera was made with, by its id, where they agree. Empty in older
     maps and in maps made without the photos."""
 
+    first_image_size: int | None = None
+    """Longer side, in pixels, of the image that the first features of a query are extracted from; `reduce`
+    finds it. None if it was not searched for."""
+
     def __post_init__(self) -> None:
         for name in ("extractor", "box_source", "unit", "origin"):
             plain(getattr(self, name), str)
         largest = plain(self.extractor_options, dict[str, Any]).get("max_image_size")
         if plain(largest, float | None) is not None and largest < 1:
             raise ValueError(f"max_image_size must be at least 1, got {largest}")
+        first = plain(self.first_image_size, int | None)
+        if first is not None and first < SMALLEST_FIRST_SIZE:
+            raise ValueError(f"first_image_size must be at least {SMALLEST_FIRST_SIZE}, got {first}")

@@ -62,6 +62,7 @@ def _info_to_json(map: Map) -> dict:
         "orientation": info.orientation,
         **({"exif_orientations": tags} if tags else {}),
         **({"devices": devices} if devices else {}),
+        **({"first_image_size": info.first_image_size} if info.first_image_size else {}),
         "quality": None if info.quality is None else asdict(info.quality),
     }
 
@@ -118,6 +119,7 @@ def _info_from_json(data: dict[str, Any]) -> MapInfo:
         quality=quality_from_json(data.get("quality")),
         orientation=plain(data.get("orientation", "upright"), Orientation),
         exif_orientations=plain(data.get("exif_orientations", {}), dict[str, int]),
+        first_image_size=plain(data.get("first_image_size"), int | None),
         devices={int(key): device for key, device in devices.items()},
     )
 

@@ -53,6 +53,10 @@ class PointDescriptors:
     """Whether a point looks unlike all other points of the full map; points with look-alikes are weak
     evidence for a pose. None in older maps."""
 
+    sizes: Float32[np.ndarray, " n"] | None = None
+    """Size of the pattern that each keypoint of a point describes, in map units: its scale in pixels times its
+    depth over the focal length. None in older maps, and if the extractor estimates no scales."""
+
     def __getitem__(self, rows: Ids) -> "PointDescriptors":
         """Select points by row, in this order."""
         return PointDescriptors(
@@ -60,6 +64,7 @@ class PointDescriptors:
             descriptors=self.descriptors[rows],
             directions=None if self.directions is None else self.directions[rows],
             distinct=None if self.distinct is None else self.distinct[rows],
+            sizes=None if self.sizes is None else self.sizes[rows],
         )
 
 
