@@ -24,6 +24,7 @@ from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.graph.edge_sources import Edges
 from slimsfm.localization import LocalizationOptions
+from slimsfm.localization.extraction import ExtractionChoice
 from slimsfm.localization.localizer import supports
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map
@@ -31,6 +32,9 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction import DominatingSetOptions, dominating_set
+
+IN_ROUNDS = "direct", "progressive"
+"""Strategies whose queries are extracted in rounds; those of the paper take the whole image."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,10 @@ class BenchmarkOptions:
     edges: Edges = "localize"
     """How to compute the reference graph; the paper localizes each image from each other image."""
 
+    extraction: ExtractionChoice = "rounds"
+    """Image that features are extracted from with the strategies progressive and direct: a small one first
+    (rounds) or the whole one (whole). The other strategies are the paper's, and always take the whole one."""
+
     reduction: DominatingSetOptions = DominatingSetOptions()
     """How to choose dominating sets."""
 
@@ -91,7 +99,7 @@ class BenchmarkOptions:
                 raise ValueError(f"{name} must be distinct and not empty, got {', '.join(values) or 'none'}")
         _ = self.parsed_methods, self.parsed_variants
         for strategy in self.strategies:
-            LocalizationOptions(strategy=strategy)  # raises for unknown strategies
+            LocalizationOptions(strategy=strategy, extraction=self.extraction)  # raises for unknown values
 
     @property
     def parsed_methods(self) -> list[Method]:
@@ -264,9 +272,10 @@ def _map_run(
     task: _MethodTask, stored: _StoredMap, strategy: str, queries: Sequence[PreparedQuery]
 ) -> MapRun:
     matcher, progress = task.method.matcher or "auto", task.setup.progress
+    extraction = task.setup.options.extraction if strategy in IN_ROUNDS else "whole"
     return MapRun(
         references=len(stored.map.images),
         points=len(stored.map.point3D_ids),
         map_bytes=stored.bytes,
-        outcomes=evaluate(stored.map, queries, strategy, matcher, progress, task.sequences.model),
+        outcomes=evaluate(stored.map, queries, strategy, matcher, progress, task.sequences.model, extraction),
     )

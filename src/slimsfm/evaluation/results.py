@@ -17,6 +17,7 @@ from slimsfm.features import Features
 from slimsfm.files import inside
 from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_error
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
+from slimsfm.localization.extraction import ExtractionChoice
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
@@ -408,17 +409,21 @@ def localize_all(
     strategy: str,
     matcher: str = "auto",
     progress: ProgressBar = silent,
+    extraction: ExtractionChoice = "whole",
 ) -> list[Localization]:
     """Localize queries one after the other.
 
-    The first query runs once more before, without timing, to fill caches.
+    The first query runs once more before, without timing, to fill caches. With extraction in rounds, the
+    images are read again, because which features are extracted depends on the map.
 
     Raises:
         ValueError: `queries` is empty.
     """
     if not queries:
         raise ValueError("queries must hold at least one query")
-    options = LocalizationOptions(strategy=strategy, matching=MatchingOptions(matcher=matcher))
+    options = LocalizationOptions(
+        strategy=strategy, matching=MatchingOptions(matcher=matcher), extraction=extraction
+    )
     localizer = Localizer(map, options)
     _localize(localizer, queries[0])
     return [_localize(localizer, query) for query in progress(queries, f"localize queries ({strategy})")]
@@ -431,6 +436,7 @@ def evaluate(
     matcher: str = "auto",
     progress: ProgressBar = silent,
     model: ObjectModel | None = None,
+    extraction: ExtractionChoice = "whole",
 ) -> Outcomes:
     """Localize queries against a map and compare the poses with the true ones.
 
@@ -441,13 +447,17 @@ def evaluate(
         matcher: Name of the matcher.
         progress: Progress callback, called once per query.
         model: Model of the object, if the data set has one.
+        extraction: Image that features are extracted from; whole takes those that are prepared.
     """
-    found = localize_all(map, queries, strategy, matcher, progress)
+    found = localize_all(map, queries, strategy, matcher, progress, extraction)
     return outcomes_of(found, [one.query.cam_from_world for one in queries], map.box, model)
 
 
 def _localize(localizer: Localizer, prepared: PreparedQuery) -> Localization:
     query = prepared.query
+    if localizer.options.extraction == "rounds":
+        photo = read_photo(query.path, query.orientation, warn=False)
+        return localizer.localize(photo.image, query.camera, mask=photo.visible)
     image = read_image(query.path, query.orientation) if localizer.looks_at_images else None
     found = localizer.localize_features(prepared.features, query.camera, image=image)
     return replace(found, seconds=replace(found.seconds, extract=prepared.extract_seconds))

@@ -65,7 +65,7 @@ def viewing_directions(map: Map) -> Float32[np.ndarray, "points 3"]:
     return directions
 
 
-def point_sizes(map: Map) -> Float32[np.ndarray, "points"] | None:
+def point_sizes(map: Map) -> Float32[np.ndarray, " points"] | None:
     """The stored size of each point's pattern, else the mean over its observations; None if unknown.
 
     Infinite for single points that it is not known of.
@@ -78,7 +78,7 @@ def point_sizes(map: Map) -> Float32[np.ndarray, "points"] | None:
     return sizes
 
 
-def _sizes(map: Map) -> Float32[np.ndarray, "points"] | None:
+def _sizes(map: Map) -> Float32[np.ndarray, " points"] | None:
     """Geometric mean of the sizes of the patterns that each point's keypoints describe."""
     sums, counts = np.zeros(len(map.point3D_ids)), np.zeros(len(map.point3D_ids))
     for name, seen in map.observations.items():

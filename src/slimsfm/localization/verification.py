@@ -265,7 +265,6 @@ class Verifier:
         visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
         return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
 
-
     def _large_enough(self, points: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> Mask:
         """Which points are so near that a detector finds them in the image."""
         if self._sizes is None:

@@ -26,7 +26,14 @@ from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction.disturbance import GOLDEN, ROUGH, Conditions, Disturbance, Keypoints, disturbed
+from slimsfm.reduction.image_size import SizeTrials
 from slimsfm.selection.usable_points import LeftOut
+
+Targets = Callable[[str], list[Target]]
+"""What a test of this name is matched with."""
+
+SMALLEST_SCALE_PX = 1.0
+"""Scale of the smallest keypoints that SIFT finds."""
 
 _MOST_TESTS = 60
 _LOST = 0.5  # largest share of correct matches that is removed
@@ -116,14 +123,22 @@ class Trials:
         sees = observed(map).astype(np.int32)
         self._common = csr_array(sees @ sees.T)
 
+    def point_targets(self, points: Ids) -> Targets:
+        """What tests are matched with if some points are kept."""
+        return lambda name: [self._described(points, name)]
+
+    def image_targets(self, names: Collection[str]) -> Targets:
+        """What tests are matched with if some references are kept."""
+        chosen = {name: self._reference(name) for name in sorted(names)}
+        return lambda test: [one for name, one in chosen.items() if name != test]
+
     def points(self, points: Ids) -> Prediction:
         """Match directly against some points, given as ascending rows of the map's points."""
-        return self._predict(self.tests, lambda name: [self._described(points, name)])
+        return self._predict(self.tests, self.point_targets(points))
 
     def images(self, names: Collection[str]) -> Prediction:
         """Match against some references; only the other references are tests."""
-        chosen = [self._reference(name) for name in sorted(names)]
-        return self._predict([name for name in self.tests if name not in names], lambda _: chosen)
+        return self._predict([name for name in self.tests if name not in names], self.image_targets(names))
 
     def full(self, tests: Collection[str], progress: ProgressBar = silent) -> Prediction:
         """Match some of the tests against all other references.
@@ -134,7 +149,7 @@ class Trials:
         found = self._predict(progress(list(tests), "localize with the full map"), self._nearest)
         return replace(found, seconds=found.seconds * (len(self._map.images) - 1) / max(used, 1))
 
-    def _predict(self, tests: Iterable[str], targets: Callable[[str], list[Target]]) -> Prediction:
+    def _predict(self, tests: Iterable[str], targets: Targets) -> Prediction:
         names, found = [], []
         with threadpool_limits(1):  # products on several threads may round differently
             for name in tests:
@@ -155,7 +170,8 @@ class Trials:
         query = self._left_out.query(name)
         matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
         seconds = self._clock() - start
-        matched = self._matched(name, matches)
+        # limits in pixels are for those in which features were found
+        matched = self._matched(name, matches, self._map.shrink_factor(name))
         start = self._clock()
         pose = matched.pose(matched.kept, matched.keypoints.pixels[matched.rows])
         seconds += self._clock() - start
@@ -167,9 +183,36 @@ class Trials:
             rough=tuple(self._error(name, one) for one in rough),
         )
 
-    def _matched(self, name: str, matches: PointMatches) -> "_Matched":
+    def sizes(self, targets: Targets) -> SizeTrials | None:
+        """Try image sizes for the queries of a reduced map.
+
+        Returns:
+            The trials; None if the extractor has no image size or no scales, or nothing can be left out.
+        """
+        largest = self._map.info.extractor_options.get("max_image_size")
+        if largest is None or not self.tests or self._left_out.query(self.tests[0]).scales is None:
+            return None
+        sides = [max(camera.width, camera.height) for camera in map(self._map.camera, self._map.images)]
+        return SizeTrials(
+            min(int(np.median(sides)), largest),
+            self.tests,
+            lambda name, size: self._pose_at(name, targets(name), size),
+            lambda pose: pose.predicted_corner_error(self._map.box),
+        )
+
+    def _pose_at(self, name: str, targets: list[Target], size: int) -> PoseEstimate | None:
+        """Localize a test by the keypoints of an image whose longer side has `size` pixels."""
         query, camera = self._left_out.query(name), self._map.camera(name)
-        factor = self._map.shrink_factor(name)  # limits in pixels are for those in which features were found
+        factor = max(1.0, max(camera.width, camera.height) / size)
+        scales = np.full(len(query.keypoints), np.inf) if query.scales is None else query.scales
+        found = np.flatnonzero(scales >= SMALLEST_SCALE_PX * factor)
+        with threadpool_limits(1):
+            matches = unite([match_target(query.descriptors[found], one, self._matching) for one in targets])
+            matched = self._matched(name, replace(matches, keypoints=found[matches.keypoints]), factor)
+            return matched.pose(matched.kept, matched.keypoints.pixels[matched.rows])
+
+    def _matched(self, name: str, matches: PointMatches, factor: float) -> "_Matched":
+        query, camera = self._left_out.query(name), self._map.camera(name)
         if factor > 1:
             camera = resized_camera(camera, 1 / factor)
         keypoints = Keypoints(
