@@ -1,5 +1,7 @@
 """Candidates with chosen figures."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from slimsfm.reduction import Candidate, Choice, Frontier, Prediction
@@ -9,6 +11,7 @@ MISSED = 4  # by the full map
 
 
 FULL_BYTES = 100_000
+DIAGONAL = 2.0
 
 
 def prediction(missed, seconds=0.01, error=0.001, rough=None):
@@ -65,5 +68,19 @@ def candidate(
     )
 
 
+def with_errors(one, median, p90, full_median=0.001, full_p90=0.002, finest=0.0):
+    """The candidate, of given corner errors, where all tests have a pose with it and with the full map."""
+
+    def prediction_of(found, middle, high):
+        errors = np.where(np.arange(TESTS) < 0.8 * TESTS, middle, high)
+        return replace(found, errors=errors, finest_error=finest)
+
+    return replace(
+        one,
+        prediction=prediction_of(one.prediction, median, p90),
+        full=prediction_of(one.full, full_median, full_p90),
+    )
+
+
 def frontier_of(*candidates):
-    return Frontier(full=FULL, candidates=candidates, bytes=FULL_BYTES)
+    return Frontier(full=FULL, candidates=candidates, bytes=FULL_BYTES, diagonal=DIAGONAL)

@@ -60,6 +60,10 @@ def test_the_figures_say_what_the_table_says(boulder, drawn):
         assert one["tests"] == MAPPING_FRAMES - len(one["images"])
         assert 0 <= one["add_0.02d"] <= one["add_0.05d"] <= one["add_0.1d"] <= 100
         assert one["ms"] > 0
+        assert 0 < one["median_corner_error"] <= one["p90_corner_error"]
+        floor = full["finest_corner_error"]
+        grown = max(one["median_corner_error"], floor) / max(full["median_corner_error"], floor)
+        assert one["images"] or one["median_factor"] == pytest.approx(grown)
 
 
 def test_the_curves_show_every_way_twice(drawn):

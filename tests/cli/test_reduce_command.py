@@ -73,7 +73,8 @@ def test_without_options_it_keeps_points_for_direct_matching(boulder, pointed):
     assert (pointed.outcome.code, pointed.outcome.err.strip()) == (0, "")
     *_, promise, speed, last, next_line = pointed.outcome.out.splitlines()
     assert "predicted to localize 1" in promise
-    assert "after 40 % hidden of what the full map does" in promise
+    assert "after 40 % hidden of what the full map does, with a median corner error of " in promise
+    assert " times the full map's (measured on " in promise
     assert f"(measured on {MAPPING_FRAMES} images left out)" in promise
     assert " than exhaustive on the full map (" in speed
     assert " than progressive, the default of localize, on the full map (" in speed

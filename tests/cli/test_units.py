@@ -2,7 +2,7 @@
 
 import pytest
 
-from slimsfm.cli.reduce_command import parse_bytes, parse_percent
+from slimsfm.cli.reduce_command import parse_bytes, parse_length, parse_percent
 from slimsfm.errors import InputError
 
 
@@ -36,6 +36,20 @@ def test_percentages(text, value):
 def test_invalid_sizes(text):
     with pytest.raises(InputError, match="max-bytes must be a size such as 100kB or 2MB, got"):
         parse_bytes(text, "max-bytes")
+
+
+@pytest.mark.parametrize(
+    ("text", "lengths"),
+    [("0.05", (0.05, None)), ("0.01d", (None, 0.01)), (" 2 D ", (None, 2.0)), ("0", (0.0, None))],
+)
+def test_lengths_are_in_map_units_or_diagonals(text, lengths):
+    assert parse_length(text, "max-error") == lengths
+
+
+@pytest.mark.parametrize("text", ["", "d", "1 cm", "-1d", "nan"])
+def test_invalid_lengths(text):
+    with pytest.raises(InputError, match=r"max-error must be a length such as 0\.05 or 0\.01d, got"):
+        parse_length(text, "max-error")
 
 
 @pytest.mark.parametrize("text", ["", "%", "1 kB", "-1%", "one"])

@@ -1,12 +1,12 @@
 """Limits, and the candidate that is taken within them."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from candidates import FULL_BYTES, MISSED, candidate, frontier_of
+from candidates import DIAGONAL, FULL_BYTES, MISSED, candidate, frontier_of, with_errors
 from slimsfm.errors import InputError
 from slimsfm.reduction import ReductionLimits, recommend
 
@@ -26,6 +26,7 @@ CANDIDATES = st.lists(
     min_size=1,
     max_size=8,
 )
+AIMED_MEDIAN, AIMED_P90 = 1.5, 2.0
 RESERVE = 2  # times the points of the smallest candidate that loses nothing
 USES = st.sampled_from(["direct", "images"])
 
@@ -66,6 +67,10 @@ def size(one):
     return len(one.choice.images), len(one.choice.points), one.prediction.median_error
 
 
+def exceeded(one):
+    return max(one.growth.median / AIMED_MEDIAN, one.growth.p90 / AIMED_P90, 1.0)
+
+
 def may_be_taken(one, use):
     return one.choice.use == use and (use, one.choice.method) != ("direct", "dominating")
 
@@ -86,7 +91,7 @@ def test_the_candidate_taken_meets_every_limit_unless_none_does(facts, use, limi
 
 @given(facts=CANDIDATES, use=USES, limits=LIMITS)
 def test_without_a_largest_loss_the_smallest_of_least_loss_is_taken_or_one_twice_as_large(facts, use, limits):
-    candidates = made(facts)
+    candidates = made({**one, "error": 0.001} for one in facts)
     limits = replace(limits, max_loss=None)
     fitting = [one for one in candidates if may_be_taken(one, use) and meets(one, limits)]
     assume(fitting)
@@ -104,6 +109,19 @@ def test_without_a_largest_loss_the_smallest_of_least_loss_is_taken_or_one_twice
         for one in smallest
         if size(one) == least
     )
+
+
+@given(facts=CANDIDATES, use=USES)
+def test_no_larger_lossless_candidate_is_nearer_to_the_aimed_growth_than_the_one_taken(facts, use):
+    candidates = made(facts)
+    usable = [one for one in candidates if may_be_taken(one, use)]
+    assume(usable)
+    taken = recommend(frontier_of(*candidates), use)
+    least = max(min(one.loss for one in usable), 0.0)
+    larger = [
+        one for one in usable if one.loss <= least and len(one.choice.points) > len(taken.choice.points)
+    ]
+    assert all(exceeded(taken) <= exceeded(one) for one in larger)
 
 
 @given(facts=CANDIDATES, use=USES, limits=LIMITS, seed=st.randoms(use_true_random=False))
@@ -139,7 +157,7 @@ def test_the_reserve_is_twice_as_many_points_by_the_same_method():
 
 
 def test_of_as_many_points_those_of_the_least_error_are_taken():
-    one, two = candidate(error=0.002, size=990), candidate(error=0.001, method="information")
+    one, two = candidate(error=0.0014, size=990), candidate(error=0.001, method="information")
     assert recommend(frontier_of(one, two), "direct") is two
     assert recommend(frontier_of(one, two), "direct", ReductionLimits(max_loss=0.0)) is two
 
@@ -171,6 +189,63 @@ def test_a_largest_loss_holds_for_rough_queries_too():
     assert recommend(frontier_of(small, large), "direct", ReductionLimits(max_loss=5.0)) is small
     with pytest.raises(InputError, match=r"loses 0\.0 points \(5\.0 on rough queries\)"):
         recommend(frontier_of(small), "direct", ReductionLimits(max_loss=1.0))
+
+
+def test_growth_is_that_of_median_and_90th_percentile():
+    growth = with_errors(candidate(), 0.002, 0.006).growth
+    assert (growth.median, growth.p90) == pytest.approx((2.0, 3.0))
+
+
+def test_errors_below_half_a_pixel_are_equal():
+    within = with_errors(candidate(), 0.0004, 0.0009, full_median=1e-5, full_p90=1e-4, finest=0.001).growth
+    assert (within.median, within.p90) == (1.0, 1.0)
+    above = with_errors(candidate(), 0.002, 0.003, full_median=1e-5, full_p90=1e-4, finest=0.001).growth
+    assert (above.median, above.p90) == pytest.approx((2.0, 3.0))
+
+
+def test_what_neither_map_localizes_does_not_grow_and_what_only_the_full_map_does_grows_without_limit():
+    neither = with_errors(candidate(), 0.001, float("inf"), full_p90=float("inf")).growth
+    assert neither.p90 == 1.0
+    assert with_errors(candidate(), 0.001, float("inf")).growth.p90 == float("inf")
+
+
+def test_errors_that_grow_are_answered_by_the_smallest_choice_within_the_aims_or_the_nearest():
+    small = with_errors(candidate(points=100), 0.004, 0.008)
+    double = with_errors(candidate(points=200), 0.0016, 0.005)
+    exact = with_errors(candidate(points=300), AIMED_MEDIAN * 0.001, AIMED_P90 * 0.002)
+    larger = with_errors(candidate(points=400), 0.001, 0.002)
+    assert recommend(frontier_of(small, double, exact, larger), "direct") is exact
+    assert recommend(frontier_of(small, double), "direct") is double
+    huge = with_errors(candidate(points=300, size=FULL_BYTES // 50 + 1), 0.001, 0.002)
+    assert recommend(frontier_of(small, double, huge), "direct") is double
+
+
+def test_limits_on_the_growth_replace_the_aims():
+    small = with_errors(candidate(points=100), 0.0029, 0.005)
+    double = with_errors(candidate(points=200), 0.0025, 0.004)
+    exact = with_errors(candidate(points=300), 0.001, 0.002)
+    found = frontier_of(small, double, exact)
+    assert recommend(found, "direct") is exact
+    assert recommend(found, "direct", ReductionLimits(max_median_factor=3.0)) is double
+    assert recommend(found, "direct", ReductionLimits(max_median_factor=3.0, max_p90_factor=3.0)) is double
+    assert recommend(found, "direct", ReductionLimits(max_p90_factor=1.9)) is exact
+    assert recommend(found, "direct", ReductionLimits(max_loss=0.0)) is small
+    assert recommend(found, "direct", ReductionLimits(max_loss=0.0, max_median_factor=2.6)) is double
+    with pytest.raises(InputError, match=r"corner error of 0.002d \(90th percentile\), 1 times"):
+        recommend(found, "direct", ReductionLimits(max_p90_factor=0.9))
+
+
+def test_a_largest_error_is_that_of_the_90th_percentile():
+    small = with_errors(candidate(points=100), 0.004, 0.008)
+    double = with_errors(candidate(points=200), 0.003, 0.006)
+    larger = with_errors(candidate(points=300), 0.003, 0.004)
+    found = frontier_of(small, double, larger)
+    for limit in (0.009, 0.006, 0.004):
+        in_units = recommend(found, "direct", ReductionLimits(max_error=limit * DIAGONAL))
+        assert in_units is recommend(found, "direct", ReductionLimits(max_relative_error=limit))
+        assert in_units is (larger if limit < 0.006 else double)
+    with pytest.raises(InputError, match=r"meets max_relative_error 0\.003; the nearest"):
+        recommend(found, "direct", ReductionLimits(max_relative_error=0.003))
 
 
 def test_images_need_no_reserve():
@@ -229,7 +304,7 @@ def test_limits_are_written_as_given():
     assert str(ReductionLimits(max_bytes=1000.0, max_loss=2.0)) == "max_loss 2, max_bytes 1000"
 
 
-@pytest.mark.parametrize("name", ["max_loss", "max_bytes", "max_ms", "max_points", "max_images"])
+@pytest.mark.parametrize("name", [field.name for field in fields(ReductionLimits)])
 def test_limits_are_not_negative(name):
     below = -1 if name in ("max_points", "max_images") else -1.0
     with pytest.raises(ValueError, match=f"{name} must not be negative, got -1"):

@@ -37,7 +37,17 @@ IMAGE_CHOICES = {
     "graph": Path("errors.csv"),
     "paper": True,
 }
-LIMITS = {"max_loss": 1.0, "max_bytes": 1e5, "max_ms": 5.0, "max_points": 100, "max_images": 3}
+LIMITS = {
+    "max_loss": 1.0,
+    "max_median_factor": 2.0,
+    "max_p90_factor": 3.0,
+    "max_error": 0.1,
+    "max_relative_error": 0.05,
+    "max_bytes": 1e5,
+    "max_ms": 5.0,
+    "max_points": 100,
+    "max_images": 3,
+}
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +155,10 @@ def test_a_graph_that_is_given_contradicts_how_to_compute_one():
 
 
 @pytest.mark.parametrize("name", IMAGE_CHOICES)
-@pytest.mark.parametrize("limit", ["max_loss", "max_ms"])
+@pytest.mark.parametrize(
+    "limit",
+    ["max_loss", "max_median_factor", "max_p90_factor", "max_error", "max_relative_error", "max_ms"],
+)
 def test_limits_that_compare_choices_contradict_a_single_one(name, limit):
     with pytest.raises(InputError, match=f"{limit}|{name}") as refusal:
         ReduceOptions(image_choice=choosing(name), limits=limited(limit))

@@ -33,6 +33,17 @@ class LimitArguments:
     """Largest loss against the full map in percentage points, such as 1%. By default nothing may be lost, and
     twice as many points as that needs are kept, or more for blurred and half hidden queries."""
 
+    max_median_factor: float | None = None
+    """How many times as large as the full map's the median corner error may be. By default 1.5 if possible,
+    unless max-loss or max-error is given."""
+
+    max_p90_factor: float | None = None
+    """The same for the 90th percentile of the corner error. By default 2 if possible, as above."""
+
+    max_error: str | None = None
+    """Largest corner error, as the 90th percentile that is predicted: in map units, which are metres if the
+    map's unit is metre, such as 0.05, or relative to the diagonal d of the box, such as 0.01d."""
+
     max_bytes: str | None = None
     """Largest size on disk, such as 100kB."""
 
@@ -51,8 +62,15 @@ class LimitArguments:
     @property
     def limits(self) -> ReductionLimits:
         """The limits in plain numbers."""
+        in_units, in_diagonals = (
+            (None, None) if self.max_error is None else parse_length(self.max_error, "max-error")
+        )
         return ReductionLimits(
             max_loss=None if self.max_loss is None else parse_percent(self.max_loss, "max-loss"),
+            max_median_factor=self.max_median_factor,
+            max_p90_factor=self.max_p90_factor,
+            max_error=in_units,
+            max_relative_error=in_diagonals,
             max_bytes=None if self.max_bytes is None else parse_bytes(self.max_bytes, "max-bytes"),
             max_ms=self.max_ms,
             max_points=self.max_points,
@@ -76,6 +94,16 @@ def parse_percent(text: str, argument: str) -> float:
         InputError: The text is not a percentage.
     """
     return _parse(text, argument, {"": 1.0, "%": 1.0}, "a percentage such as 1%")
+
+
+def parse_length(text: str, argument: str) -> tuple[float | None, float | None]:
+    """Read a length in map units, or in diagonals of the box with a suffix d; the other one is None.
+
+    Raises:
+        InputError: The text is not a length.
+    """
+    value = _parse(text, argument, {"": 1.0, "d": 1.0}, "a length such as 0.05 or 0.01d")
+    return (None, value) if text.strip().lower().endswith("d") else (value, None)
 
 
 def _parse(text: str, argument: str, units: dict[str, float], example: str) -> float:

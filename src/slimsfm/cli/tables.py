@@ -99,9 +99,27 @@ def promise(full_path: Path, full: Map, candidate: Candidate) -> str:
     for disturbance, slim, best in zip(ROUGH, *rough, strict=False):
         shares.append(f"{_share(slim, best)} after {disturbance.name}")
     return (
-        f"{before} -> {after}; predicted to localize {', '.join(shares)} of what the full map does "
-        f"(measured on {plural(tests, 'image')} left out)"
+        f"{before} -> {after}; predicted to localize {', '.join(shares)} of what the full map does, "
+        f"{_errors(full, candidate)} (measured on {plural(tests, 'image')} left out)"
     )
+
+
+def _errors(full: Map, candidate: Candidate) -> str:
+    """Say how large the corner errors are, and how many times as large as with the full map."""
+    prediction, growth = candidate.prediction, candidate.growth
+    median, p90 = (_length(one, full) for one in (prediction.median_error, prediction.p90_error))
+    return (
+        f"with a median corner error of {median} and a 90th percentile of {p90}, {growth.median:.2g} and "
+        f"{growth.p90:.2g} times the full map's"
+    )
+
+
+def _length(error: float, map: Map) -> str:
+    """A relative corner error, and in centimeters where the unit is known."""
+    if np.isinf(error):
+        return "infinity"
+    in_cm = f" ({1e2 * error * map.box.diagonal:.2g} cm)" if map.info.unit == "metre" else ""
+    return f"{error:.2g}d{in_cm}"
 
 
 def _share(part: float, whole: float) -> str:
@@ -134,9 +152,9 @@ def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], ful
         table.add_column(column)
     for column in ("images", "points", "size", *(f"{fraction}d" for fraction in ADD_FRACTIONS)):
         table.add_column(column, justify="right")
-    for column in ("loss", "rough loss", "median", "match+pose", ""):
+    for column in ("loss", "rough loss", "median", "p90", "growth", "match+pose", ""):
         table.add_column(column, justify="right" if column else "left")
-    full = _figures(frontier.full, 0.0, 0.0 if frontier.full.rough_errors.size else None)
+    full = _figures(frontier.full, 0.0, 0.0 if frontier.full.rough_errors.size else None, "")
     table.add_row("", "full map", "exhaustive", "", "", size(full_bytes), *full)
     for one in sorted(frontier.candidates, key=lambda one: (one.choice.use, one.choice.method, one.bytes)):
         remark, style = _remark(frontier, recommended, one)
@@ -144,23 +162,34 @@ def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], ful
         what = (choice.use, choice.method, choice.detail, str(len(choice.images) or ""))
         weight = (str(len(choice.points)), size(one.bytes))
         table.add_row(
-            *what, *weight, *_figures(one.prediction, one.loss, one.rough_loss), remark, style=style
+            *what,
+            *weight,
+            *_figures(one.prediction, one.loss, one.rough_loss, _growth(one)),
+            remark,
+            style=style,
         )
     console.print(table)
     console.print(
         f"0.1d, 0.05d, 0.02d: % of {len(frontier.full.tests)} images or fewer, left out and given fewer "
         "matches, whose mean corner error is below this share of the diagonal d; loss: percentage points "
         "lost against the full map on the same images, the largest of the three; rough loss: within 0.1d, "
-        f"the largest of {' and '.join(one.name for one in ROUGH)}; match+pose: median per query; "
+        f"the largest of {' and '.join(one.name for one in ROUGH)}; median, p90: median and 90th "
+        "percentile of the corner error; growth: factors of both against the full map, where errors below "
+        f"{frontier.full.finest_error:.2g}d, half a pixel, count as this; match+pose: median per query; "
         "Pareto-dominated: another choice for the same use is not larger and loses no more",
         style="dim",
     )
 
 
-def _figures(prediction: Prediction, loss: float, rough_loss: float | None) -> list[str]:
+def _growth(one: Candidate) -> str:
+    return f"{one.growth.median:.2f} {one.growth.p90:.2f}" if one.prediction.tests else ""
+
+
+def _figures(prediction: Prediction, loss: float, rough_loss: float | None, growth: str) -> list[str]:
     shares = [f"{prediction.within(fraction):.1f}" for fraction in ADD_FRACTIONS]
     losses = [f"{loss:.1f}", "" if rough_loss is None else f"{rough_loss:.1f}"]
-    return [*shares, *losses, f"{prediction.median_error:.4f}d", f"{1e3 * prediction.seconds:.2f} ms"]
+    errors = [f"{error:.4f}d" for error in (prediction.median_error, prediction.p90_error)]
+    return [*shares, *losses, *errors, growth, f"{1e3 * prediction.seconds:.2f} ms"]
 
 
 def _remark(
@@ -188,6 +217,8 @@ def frontier_to_json(
                 "bytes": one.bytes,
                 "loss": one.loss,
                 "rough_loss": one.rough_loss,
+                "median_factor": _finite(one.growth.median),
+                "p90_factor": _finite(one.growth.p90),
                 "dominated": frontier.is_pareto_dominated(one),
                 "recommended": any(best is one for best in recommended.values()),
                 **_prediction_to_json(one.prediction),
@@ -198,7 +229,6 @@ def frontier_to_json(
 
 
 def _prediction_to_json(prediction: Prediction) -> dict:
-    median = prediction.median_error
     return {
         "tests": len(prediction.tests),
         **{f"add_{fraction}d": prediction.within(fraction) for fraction in ADD_FRACTIONS},
@@ -206,9 +236,15 @@ def _prediction_to_json(prediction: Prediction) -> dict:
             one.name: share
             for one, share in zip(ROUGH, prediction.rough_within(ADD_FRACTIONS[0]), strict=False)
         },
-        "median_corner_error": median if np.isfinite(median) else None,
+        "median_corner_error": _finite(prediction.median_error),
+        "p90_corner_error": _finite(prediction.p90_error),
+        "finest_corner_error": prediction.finest_error,
         "ms": 1e3 * prediction.seconds,
     }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def print_summary(summary: RunSummary) -> None:

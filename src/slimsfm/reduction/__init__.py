@@ -3,11 +3,10 @@
 from slimsfm.reduction.choice import (
     Candidate,
     Choice,
+    ErrorGrowth,
     Frontier,
-    ReductionLimits,
     apply_choice,
     points_seen,
-    recommend,
 )
 from slimsfm.reduction.disturbance import Conditions
 from slimsfm.reduction.forecast import Prediction, Trials
@@ -18,6 +17,7 @@ from slimsfm.reduction.image_sets import (
     images_within,
     keep_random_images,
 )
+from slimsfm.reduction.limits import ReductionLimits, recommend
 from slimsfm.reduction.pareto import USES, FrontierOptions, GraphProvider, forecast_images, frontier
 from slimsfm.reduction.reduced import ImageOptions, Reduced, ReduceOptions, reduce
 from slimsfm.reduction.speed import Speed, measure_speed
@@ -28,6 +28,7 @@ __all__ = [
     "Choice",
     "Conditions",
     "DominatingSetOptions",
+    "ErrorGrowth",
     "Frontier",
     "FrontierOptions",
     "GraphProvider",

@@ -1,13 +1,11 @@
-"""Choices of what to keep, what each is predicted to do, and the limits by which one is recommended."""
+"""Choices of what to keep of a map, and what each is predicted to do."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from slimsfm.arrays import Ids
-from slimsfm.errors import InputError
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.map import Map, PointDescriptors
@@ -36,6 +34,27 @@ class Choice:
 
     points: Ids
     """Rows of the points that are kept, ascending."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorGrowth:
+    """How many times as large as with the full map the corner errors of the same queries are.
+
+    Errors below `Prediction.finest_error` count as this error, so that a multiple of nearly nothing is no
+    growth. A percentile that has a pose with neither map does not grow.
+    """
+
+    median: float
+    """Factor of the median."""
+
+    p90: float
+    """Factor of the 90th percentile."""
+
+
+def _factor(slim: float, full: float, floor: float) -> float:
+    if slim == full or max(slim, full) <= floor:
+        return 1.0
+    return max(slim, floor) / max(full, floor)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,6 +94,15 @@ class Candidate:
         """The largest of the losses on disturbed queries, in percentage points; None if none was tried."""
         return max(self.rough_losses, default=None)
 
+    @cached_property
+    def growth(self) -> ErrorGrowth:
+        """How many times as large as the full map's the corner errors are."""
+        floor = self.full.finest_error
+        return ErrorGrowth(
+            median=_factor(self.prediction.median_error, self.full.median_error, floor),
+            p90=_factor(self.prediction.p90_error, self.full.p90_error, floor),
+        )
+
     @property
     def seconds(self) -> float:
         """Predicted time of matching and pose per query."""
@@ -93,6 +121,9 @@ class Frontier:
 
     bytes: int
     """Size of the full map on disk."""
+
+    diagonal: float
+    """Diagonal of the map's box, in map units."""
 
     def is_pareto_dominated(self, one: Candidate) -> bool:
         """Whether another candidate for the same use is not larger, loses no more, and is better in one."""
@@ -122,169 +153,3 @@ def apply_choice(map: Map, choice: Choice, *, described: PointDescriptors | None
 def points_seen(map: Map, images: tuple[str, ...]) -> Ids:
     """Rows of the points that some images see, ascending: P' in the paper."""
     return np.unique(np.concatenate([map.observations[name].points for name in images]))
-
-
-_RESERVE = 2.0  # times the points of the smallest candidate that loses nothing
-_ROUGH_LOSS = 2.0  # percentage points: forecasts are a few points too optimistic, and 5 may be lost
-_LEAST_FACTOR = 50  # a reserve for rough queries leaves the map so many times smaller than the full one
-_TINY = 1e-9
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReductionLimits:
-    """Limits of a reduced map; the smallest candidate within them is taken."""
-
-    max_loss: float | None = None
-    """Largest loss against the full map within each of 0.1, 0.05 and 0.02 d, in percentage points, and within
-    0.1 d on rough queries if these are predicted; None: the least possible, with a reserve."""
-
-    max_bytes: float | None = None
-    """Largest size of the map on disk, in bytes."""
-
-    max_ms: float | None = None
-    """Longest time of matching and pose per query on this machine, in milliseconds."""
-
-    max_points: int | None = None
-    """Largest number of points."""
-
-    max_images: int | None = None
-    """Largest number of images, where images are kept."""
-
-    def __post_init__(self) -> None:
-        for name, value in self.given.items():
-            if not value >= 0:
-                raise ValueError(f"{name} must not be negative, got {value}")
-
-    @property
-    def given(self) -> dict[str, int | float]:
-        """The limits that are set, by name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if value is not None}
-
-    def __str__(self) -> str:
-        return ", ".join(f"{name} {value:g}" for name, value in self.given.items())
-
-
-def recommend(frontier: Frontier, use: str, limits: ReductionLimits = ReductionLimits()) -> Candidate:
-    """Take the smallest candidate for a use that meets the limits.
-
-    Without `max_loss`, the smallest candidate that loses nothing on the references is replaced by one of the
-    same method with twice as many points, if there is one: queries resemble the references less than these
-    resemble each other. If every candidate loses something, the one that loses least is taken.
-
-    If rough queries were predicted, and that choice loses more than 2 points on them, it is replaced by the
-    smallest one that neither does that nor loses more on clean queries. Such a map has at most a fiftieth of
-    the full map's bytes; if none of this size suffices, the one that loses least on rough queries is taken.
-
-    Raises:
-        InputError: No candidate meets the limits.
-    """
-    usable = [one for one in frontier.candidates if _is_usable(one.choice, use) and one.prediction.tests]
-    if not usable:
-        raise InputError(f"there is no way to reduce this map for {use}")
-    fitting = [one for one in usable if _excess(_figures(one), limits) <= 0]
-    if not fitting:
-        nearest = min(usable, key=lambda one: (_excess(_figures(one), limits), _size(one)))
-        raise InputError(
-            f"{_refusal(nearest.choice, nearest.bytes, limits)}, loses {nearest.loss:.1f} points"
-            f"{_rough(nearest)} and takes {1e3 * nearest.seconds:.2g} ms"
-        )
-    if limits.max_loss is not None:
-        return min(fitting, key=_size)
-    least = max(min(one.loss for one in fitting), 0.0)
-    lossless = [one for one in fitting if one.loss <= least]
-    reserved = _with_reserve(min(lossless, key=_size), fitting)
-    return _for_rough(reserved, lossless, frontier.bytes / _LEAST_FACTOR)
-
-
-def check_reachable(
-    choices: Sequence[Choice], sizes: Sequence[int], use: str, limits: ReductionLimits
-) -> None:
-    """Refuse limits that no choice can meet, before anything is predicted.
-
-    Args:
-        choices: The choices that would be predicted.
-        sizes: The bytes of their maps.
-        use: "direct" or "images".
-        limits: The limits; those on loss and time are not checked here.
-
-    Raises:
-        InputError: No choice for the use meets the limits; the nearest one is named.
-    """
-    usable = [pair for pair in zip(choices, sizes, strict=True) if _is_usable(pair[0], use)]
-    excesses = [_excess(_weights(*pair), limits) for pair in usable]
-    if usable and min(excesses) > 0:
-        nearest = usable[excesses.index(min(excesses))]
-        raise InputError(_refusal(*nearest, limits))
-
-
-def _is_usable(choice: Choice, use: str) -> bool:
-    """Whether a choice may be taken: the points of a dominating set are only listed for comparison."""
-    return choice.use == use and (use, choice.method) != ("direct", DOMINATING)
-
-
-def _weights(choice: Choice, size: int) -> dict[str, int | float]:
-    return {"max_bytes": size, "max_points": len(choice.points), "max_images": len(choice.images)}
-
-
-def _figures(one: Candidate) -> dict[str, int | float]:
-    return {
-        **_weights(one.choice, one.bytes),
-        "max_loss": max((one.loss, *one.rough_losses)),
-        "max_ms": 1e3 * one.seconds,
-    }
-
-
-def _excess(figures: dict[str, int | float], limits: ReductionLimits) -> float:
-    """By how much figures exceed the limits, the worst one counted: 0 or less where all limits are met."""
-    excesses = [0.0]
-    for name, limit in limits.given.items():
-        if figures.get(name, limit) > limit:
-            unit = 1.0 if name == "max_loss" else _TINY
-            excesses.append((figures[name] - limit) / max(limit, unit))
-    return max(excesses)
-
-
-def _size(one: Candidate) -> tuple[int, int, float]:
-    """Fewer images and points first; among equals the more accurate."""
-    return len(one.choice.images), len(one.choice.points), one.prediction.median_error
-
-
-def _with_reserve(smallest: Candidate, fitting: list[Candidate]) -> Candidate:
-    enough = _RESERVE * len(smallest.choice.points)
-    larger = [
-        one
-        for one in fitting
-        if one.choice.method == smallest.choice.method
-        and len(one.choice.points) >= enough
-        and one.choice.use == "direct"
-    ]
-    return min(larger, key=_size, default=smallest)
-
-
-def _rough(one: Candidate) -> str:
-    return "" if one.rough_loss is None else f" ({one.rough_loss:.1f} on rough queries)"
-
-
-def _for_rough(reserved: Candidate, lossless: list[Candidate], most_bytes: float) -> Candidate:
-    """The candidate with a reserve, or a larger one if it loses too much on rough queries."""
-    if _rough_excess(reserved) == 0:
-        return reserved
-    larger = [
-        one
-        for one in lossless
-        if len(one.choice.points) > len(reserved.choice.points) and one.bytes <= most_bytes
-    ]
-    return min([reserved, *larger], key=lambda one: (_rough_excess(one), _size(one)))
-
-
-def _rough_excess(one: Candidate) -> float:
-    return max((one.rough_loss or 0.0) - _ROUGH_LOSS, 0.0)
-
-
-def _refusal(nearest: Choice, size: int, limits: ReductionLimits) -> str:
-    images = f"{len(nearest.images)} images, " if nearest.images else ""
-    return (
-        f"no choice for {nearest.use} meets {limits}; the nearest, {nearest.method} ({nearest.detail}), "
-        f"has {images}{len(nearest.points)} points and {size} bytes"
-    )

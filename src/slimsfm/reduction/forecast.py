@@ -24,6 +24,7 @@ from slimsfm.localization.strategy import PointMatches, Target, unite
 from slimsfm.mapping.descriptors import quantize
 from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
+from slimsfm.pose.types import MIN_SIGMA_PX
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction.disturbance import GOLDEN, ROUGH, Conditions, Disturbance, Keypoints, disturbed
 from slimsfm.reduction.image_size import SizeTrials
@@ -59,6 +60,10 @@ class Prediction:
     rough_errors: Float64[np.ndarray, "tests disturbances"]
     """Relative corner error of each test after each disturbance; no columns if none was tried."""
 
+    finest_error: float = 0.0
+    """Relative corner error that half a pixel amounts to at the distance of the points, the median over the
+    map's tests: no detector is more accurate, so smaller errors count as equal."""
+
     def within(self, fraction: float) -> float:
         """Percentage of the tests whose relative corner error is below a fraction."""
         return 100 * float(np.mean(self.errors < fraction)) if len(self.errors) else 0.0
@@ -83,6 +88,11 @@ class Prediction:
     def median_error(self) -> float:
         """Median relative corner error."""
         return float(np.median(self.errors)) if len(self.errors) else np.inf
+
+    @property
+    def p90_error(self) -> float:
+        """90th percentile of the relative corner error; infinite if more than a tenth have no pose."""
+        return float(np.quantile(self.errors, 0.9, method="higher")) if len(self.errors) else np.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +132,7 @@ class Trials:
         self.tests = tuple(names[place] for place in places)
         sees = observed(map).astype(np.int32)
         self._common = csr_array(sees @ sees.T)
+        self._finest_error = float(np.median([_half_pixel(map, name) for name in self.tests] or [0.0]))
 
     def point_targets(self, points: Ids) -> Targets:
         """What tests are matched with if some points are kept."""
@@ -163,6 +174,7 @@ class Trials:
             rough_errors=np.array([one.rough for one in found], np.float64).reshape(
                 len(found), len(self._disturbances)
             ),
+            finest_error=self._finest_error,
         )
 
     def _try(self, name: str, targets: list[Target]) -> _Trial:
@@ -254,6 +266,16 @@ class Trials:
     @lru_cache(maxsize=4 * _MOST_REFERENCES)  # noqa: B019, trials are few and short-lived
     def _reference(self, name: str) -> Target:
         return reference_target(self._map, name)
+
+
+def _half_pixel(map: Map, name: str) -> float:
+    """What half a pixel, of those in which features are found, is at the points of an image, in diagonals."""
+    seen = map.points3D_in_world[map.observations[name].points]
+    depths = (map.images[name].cam_from_world() * seen)[:, 2]
+    if not len(depths):
+        return 0.0
+    focal_px = map.camera(name).mean_focal_length() / map.shrink_factor(name)
+    return MIN_SIGMA_PX * float(np.median(depths)) / (focal_px * map.box.diagonal)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

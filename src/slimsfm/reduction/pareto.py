@@ -18,14 +18,13 @@ from slimsfm.reduction.choice import (
     Candidate,
     Choice,
     Frontier,
-    ReductionLimits,
     apply_choice,
-    check_reachable,
     points_seen,
 )
 from slimsfm.reduction.disturbance import Conditions, check_conditions
 from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.image_sets import DominatingSetOptions, dominating_set
+from slimsfm.reduction.limits import ReductionLimits, check_reachable
 from slimsfm.selection import REPLACED_SELECTORS, SELECTORS, current_selector
 from slimsfm.selection.problem import SelectionProblem
 from slimsfm.selection.usable_points import LeftOut, selection_problem
@@ -123,7 +122,7 @@ def frontier(
         check_reachable(choices, sizes, use, limits)
     trials = Trials(map, left_out, conditions=options.conditions)
     full, candidates = _predicted(trials, choices, sizes, progress)
-    return Frontier(full=full, candidates=candidates, bytes=weigh_map(map))
+    return Frontier(full=full, candidates=candidates, bytes=weigh_map(map), diagonal=map.box.diagonal)
 
 
 def _predicted(

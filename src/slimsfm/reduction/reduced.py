@@ -17,7 +17,7 @@ from slimsfm.mapping.io import weigh_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images, with_points
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.reduction.choice import DOMINATING, Candidate, ReductionLimits, apply_choice, recommend
+from slimsfm.reduction.choice import DOMINATING, Candidate, apply_choice
 from slimsfm.reduction.disturbance import Conditions, check_conditions
 from slimsfm.reduction.image_sets import (
     Cost,
@@ -27,6 +27,7 @@ from slimsfm.reduction.image_sets import (
     images_within,
     keep_random_images,
 )
+from slimsfm.reduction.limits import ReductionLimits, recommend
 from slimsfm.reduction.pareto import (
     FrontierOptions,
     GraphProvider,
@@ -40,6 +41,14 @@ from slimsfm.selection import REPLACED_SELECTORS, current_selector
 Use = Literal["direct", "images", "both"]
 
 _EXCLUSIVE = ("images", "random", "paper")
+_NEED_SEVERAL = (
+    "max_loss",
+    "max_median_factor",
+    "max_p90_factor",
+    "max_error",
+    "max_relative_error",
+    "max_ms",
+)
 _SET_OPTIONS = ("solver", "dominators", "cost", "threshold")
 
 
@@ -173,7 +182,7 @@ class ReduceOptions:
             if idle:
                 raise InputError(f"{first} leaves nothing to choose, so {idle[0]} cannot limit it")
             return
-        for name in ("max_loss", "max_ms"):
+        for name in _NEED_SEVERAL:
             if name in limits:
                 raise InputError(f"{name} needs several ways to choose images, but {first} leaves only one")
         try:
