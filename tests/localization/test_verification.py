@@ -91,6 +91,7 @@ def test_a_search_does_not_stop_with_accurate_inliers_in_one_corner():
     def round_with(evidence):
         nothing = PointMatches.none()
         return RoundResult(
+            query=query_of_nothing(),
             matches=nothing,
             pose=None,
             camera=camera(),

@@ -1,61 +1,128 @@
 """Features of a query in rounds, from a small version of the image to the whole one.
 
-Most queries are localized by a tenth of their pixels, and extraction takes time in proportion to them. So
-features are extracted from a shrunken image first, and from a larger one only if the pose is not sure. All
-rounds together have at most four thirds of the pixels of the whole image.
+Most queries are localized by a seventh of their pixels, and extraction takes time in proportion to them. So
+features are extracted from a shrunken image first. If the pose is not sure, a larger image follows, of the
+part where the map's points should be if there is a pose, and finally the whole image. All rounds before the
+last have at most a third of its pixels.
 """
 
+from collections.abc import Generator
+from dataclasses import replace
 from functools import lru_cache
-from math import sqrt
+from math import ceil, sqrt
 from time import perf_counter
 from typing import Literal, NamedTuple
 
-from slimsfm.arrays import GrayImage, Image
-from slimsfm.features import Extractor, Features, load_extractor
+import numpy as np
+
+from slimsfm.arrays import GrayImage, Image, Points2D
+from slimsfm.features import Extractor, Features, load_extractor, shrink_factor
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
+from slimsfm.photos import shrink
 
 ExtractionChoice = Literal["rounds", "whole"]
 
 FIRST_SIZES = 128, 160, 200, 240, 280, 320, 360, 400, 480, 560, 640, 800
 """Longer sides of the first image, in pixels, that `reduce` tries."""
 
+SMALLEST_SCALE_PX = 1.0
+"""Scale of the smallest keypoints that SIFT finds."""
+
 _FIRST = 0.39  # of the longer side: a seventh of the pixels
 _LEAST = 128  # pixels: smaller images are extracted at once
 _MORE_PIXELS = 1 / 3  # of all rounds before the last, relative to the last
 _GROWTH = 1.4  # of the longer side from round to round, at least
+_MARGIN = 0.1  # around the part where points should be, relative to its sides
+_LEAST_MARGIN = 0.02  # of the longer side of the image
 _MOST_SIZES = 16  # extractors that are kept
 
 
-def first_size(whole: int) -> int:
-    """Longer side of the first image for a map that says nothing of it; it may be that of the whole image."""
+def usual_first_size(whole: int) -> int:
+    """Longer side of the first image for a map that says nothing of it, in pixels."""
     return max(_LEAST, round(_FIRST * whole))
 
 
-def image_sizes(whole: int, first: int) -> tuple[int, ...]:
-    """Longer sides of the images from which features are extracted in turn, in pixels.
-
-    All images before the last have at most a third of its pixels.
+def second_size(whole: int, first: int, share: float = 1.0) -> int | None:
+    """Longer side of the second image, in pixels; None if it would not be much larger than the first one.
 
     Args:
-        whole: Longer side of the image from which the extractor would extract at once.
-        first: Longer side to begin with. If it is not much smaller than the whole image, that is the only
-            one.
+        whole: Longer side of the whole image.
+        first: Longer side of the first image.
+        share: Share of the image that features are extracted from.
     """
-    if first > whole * sqrt(_MORE_PIXELS):
-        return (whole,)
-    second = int(sqrt(_MORE_PIXELS * whole**2 - first**2))
-    return (first, second, whole) if second >= _GROWTH * first else (first, whole)
+    left = max(_MORE_PIXELS - (first / whole) ** 2, 0.0)
+    size = min(whole, int(whole * sqrt(left / share)))
+    return size if size >= _GROWTH * first else None
+
+
+class Window(NamedTuple):
+    """A part of an image, in pixels."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def area(self) -> int:
+        """Number of pixels."""
+        return (self.right - self.left) * (self.bottom - self.top)
+
+    @classmethod
+    def around(cls, pixels: Points2D, width: int, height: int) -> "Window | None":
+        """The part of an image that shows some of these pixels and a margin; None if it shows none."""
+        size = np.array([width, height])
+        inside = pixels[np.all((pixels >= 0) & (pixels < size), axis=1)]
+        if not len(inside):
+            return None
+        low, high = inside.min(axis=0), inside.max(axis=0)
+        margin = _MARGIN * (high - low) + _LEAST_MARGIN * size.max()
+        (left, top), (right, bottom) = np.maximum(low - margin, 0), np.minimum(high + margin, size)
+        return cls(int(left), int(top), ceil(right), ceil(bottom))
 
 
 class Extracted(NamedTuple):
-    """Features of an image, extracted at a size."""
+    """Features of an image or a part of it, extracted at a size."""
 
     features: Features
     """In pixels of the image."""
 
     shrink_factor: float
     """Pixels of the image per pixel in which they were found."""
+
+
+class Level(NamedTuple):
+    """Features of one round of extraction."""
+
+    extracted: Extracted
+    """The features."""
+
+    is_last: bool
+    """Whether no more features follow."""
+
+
+class Seen(NamedTuple):
+    """What a search has found with the features of a level."""
+
+    window: Window | None = None
+    """Where the points of the map should be, if there is a pose that is believed."""
+
+    is_sure: bool = False
+    """Whether the pose is sure, and only not exact enough."""
+
+    def share(self, width: int, height: int) -> float:
+        """Share of an image that the window covers."""
+        return 1.0 if self.window is None else self.window.area / (width * height)
+
+
+Levels = Generator[Level, Seen, None]
+"""Yields features, finer ones or more of them in each round; is sent what was found with the last ones."""
+
+
+def given_features(features: Features, factor: float) -> Levels:
+    """The one level of features that have been extracted; `factor` is their `Extracted.shrink_factor`."""
+    yield Level(Extracted(features, factor), is_last=True)
 
 
 class SizedExtractor:
@@ -75,28 +142,50 @@ class SizedExtractor:
         """Equal for extractors that extract the same."""
         return repr((self.whole.name, sorted(self.whole.options.items())))
 
-    def sizes(self, image: Image) -> tuple[int, ...]:
-        """The longer sides of the rounds for an image; one if the extractor has no image size."""
-        longer = max(image.shape[:2])
-        largest = self.whole.options.get("max_image_size")
-        if largest is None:
-            return (longer,)
-        whole = min(longer, largest)
-        return image_sizes(whole, self._first or first_size(whole))
+    def whole_size(self, width: int, height: int) -> int:
+        """Longer side of the image from which all features are extracted at once."""
+        longer = max(width, height)
+        return min(longer, self.whole.options.get("max_image_size") or longer)
+
+    def first_size(self, width: int, height: int) -> int:
+        """Longer side of the first image; that of the whole one if no smaller image is of use."""
+        whole = self.whole_size(width, height)
+        if "max_image_size" not in self.whole.options:
+            return whole
+        first = self._first or usual_first_size(whole)
+        return first if first**2 <= _MORE_PIXELS * whole**2 else whole
 
     def extract(self, image: Image, mask: GrayImage | None, size: int) -> Extracted:
         """Extract the features of an image whose longer side is shrunk to `size` pixels."""
-        longer = max(image.shape[:2])
-        largest = self.whole.options.get("max_image_size", longer)
-        extractor = self.whole if size >= min(longer, largest) else self._of_size(size)
-        return Extracted(extractor.extract(image, mask), max(1.0, longer / size))
+        height, width = image.shape[:2]
+        is_whole = size >= self.whole_size(width, height)
+        extractor = self.whole if is_whole else self._of_size(size)
+        return Extracted(extractor.extract(image, mask), max(1.0, max(width, height) / size))
+
+    def extract_part(self, image: Image, mask: GrayImage | None, size: int, window: Window) -> Extracted:
+        """Extract the features of a part of an image whose longer side is shrunk to `size` pixels."""
+        height, width = image.shape[:2]
+        part = slice(window.top, window.bottom), slice(window.left, window.right)
+        side = max(window.right - window.left, window.bottom - window.top)
+        wanted = max(1, round(side * size / max(width, height)))
+        small = shrink(np.ascontiguousarray(image[part]), wanted)
+        small_mask = None if mask is None else shrink(np.ascontiguousarray(mask[part]), wanted)
+        found, factor = self.whole.extract(small, small_mask), side / max(small.shape[:2])
+        frames = found.frames
+        moved = replace(
+            found,
+            keypoints=found.keypoints * np.float32(factor) + np.array([window.left, window.top], np.float32),
+            image_size=(width, height),
+            frames=None if frames is None else frames * np.array([factor, 1], np.float32),
+        )
+        return Extracted(moved, factor * shrink_factor(self.whole.options, *small.shape[1::-1]))
 
     def _with_size(self, size: int) -> Extractor:
         return load_extractor(self.whole.name, {**self.whole.options, "max_image_size": size})
 
 
 class ImageRounds:
-    """Features of one image, from coarse to fine; each size is extracted once.
+    """Features of one image, from coarse to fine; each size of the whole image is extracted once.
 
     Attributes:
         image: The image.
@@ -108,11 +197,33 @@ class ImageRounds:
         self._extracted: dict[tuple[str, int], Extracted] = {}
         self.seconds = 0.0
 
-    def at(self, extractor: SizedExtractor, size: int) -> Extracted:
-        """The features at a size by an extractor; extracts them unless an equal extractor has done it."""
+    def levels(self, extractor: SizedExtractor, choice: ExtractionChoice) -> Levels:
+        """Extract features for one map; see `Levels`."""
+        height, width = self.image.shape[:2]
+        whole = extractor.whole_size(width, height)
+        first = whole if choice == "whole" else extractor.first_size(width, height)
+        if first < whole:
+            seen = yield Level(self._at(extractor, first), is_last=False)
+            if size := second_size(whole, first, seen.share(width, height)):
+                seen = yield Level(self._part(extractor, size, seen.window), is_last=False)
+            if seen.is_sure and seen.window:
+                yield Level(self._part(extractor, whole, seen.window), is_last=True)
+                return
+        yield Level(self._at(extractor, whole), is_last=True)
+
+    def _at(self, extractor: SizedExtractor, size: int) -> Extracted:
+        """The features at a size; extracts them unless an equal extractor has done it."""
         key = extractor.key, size
         if key not in self._extracted:
             start = perf_counter()
             self._extracted[key] = extractor.extract(self.image, self._mask, size)
             self.seconds += perf_counter() - start
         return self._extracted[key]
+
+    def _part(self, extractor: SizedExtractor, size: int, window: Window | None) -> Extracted:
+        if window is None:
+            return self._at(extractor, size)
+        start = perf_counter()
+        found = extractor.extract_part(self.image, self._mask, size, window)
+        self.seconds += perf_counter() - start
+        return found

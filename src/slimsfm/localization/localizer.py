@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from time import perf_counter
 from typing import get_args
 
@@ -18,7 +17,13 @@ from slimsfm.localization.cameras import (
     QueryCamera,
     camera_in_memory,
 )
-from slimsfm.localization.extraction import ExtractionChoice, ImageRounds, SizedExtractor
+from slimsfm.localization.extraction import (
+    Extracted,
+    ExtractionChoice,
+    ImageRounds,
+    SizedExtractor,
+    given_features,
+)
 from slimsfm.localization.matching import extract_near
 from slimsfm.localization.outcome import Localization, Seconds
 from slimsfm.localization.search import RoundResult, Search, SearchResult
@@ -166,16 +171,13 @@ class Localizer:
         """
         image, before = rounds.image, rounds.seconds
         camera = self.camera_of(image, camera)
-        sizes = self._extractor.sizes(image)
-        if self.options.extraction == "whole" or self.looks_at_images:
-            sizes = sizes[-1:]
-        levels = [partial(self._extracted_query, rounds, size, camera.camera) for size in sizes]
-        found = self._search.run(levels, camera, gravity)
+        choice = "whole" if self.looks_at_images else self.options.extraction
+        levels = rounds.levels(self._extractor, choice)
+        found = self._search.run(levels, self._preparing(camera, image), camera, gravity)
         return self._localization(found, camera, rounds.seconds - before)
 
-    def _extracted_query(self, rounds: ImageRounds, size: int, camera: pycolmap.Camera) -> Query:
-        found = rounds.at(self._extractor, size)
-        return self._query(found.features, camera, found.shrink_factor, rounds.image)
+    def _preparing(self, camera: QueryCamera, image: Image | None = None) -> Callable[[Extracted], Query]:
+        return lambda one: self._query(one.features, camera.camera, one.shrink_factor, image)
 
     def localize_near(
         self,
@@ -232,23 +234,24 @@ class Localizer:
             ValueError: The camera is impossible.
         """
         camera = _given(camera)
-        found = self._search.run([partial(self._whole_query, features, camera, image)], camera, gravity)
+        levels = given_features(features, self._shrink_factor(camera))
+        found = self._search.run(levels, self._preparing(camera, image), camera, gravity)
         return self._localization(found, camera, 0.0)
 
     def search(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> SearchResult:
         """Localize an image by its features, with the evidence, and without a limit on the confidence."""
         camera = _given(camera)
-        return self._search.run([partial(self._whole_query, features, camera)], camera)
+        levels = given_features(features, self._shrink_factor(camera))
+        return self._search.run(levels, self._preparing(camera), camera)
 
     def rounds(self, features: Features, camera: pycolmap.Camera | QueryCamera) -> Iterator[RoundResult]:
         """Run all rounds of the strategy, without stopping early."""
         camera = _given(camera)
-        return self._search.rounds(self._whole_query(features, camera), camera)
+        query = self._query(features, camera.camera, self._shrink_factor(camera), None)
+        return self._search.rounds(query, camera)
 
-    def _whole_query(self, features: Features, camera: QueryCamera, image: Image | None = None) -> Query:
-        width, height = camera.camera.width, camera.camera.height
-        factor = shrink_factor(self.extractor.options, width, height)
-        return self._query(features, camera.camera, factor, image)
+    def _shrink_factor(self, camera: QueryCamera) -> float:
+        return shrink_factor(self.extractor.options, camera.camera.width, camera.camera.height)
 
     def _localization(self, found: SearchResult, camera: QueryCamera, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence

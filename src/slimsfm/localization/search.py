@@ -1,15 +1,17 @@
 """Match a query in rounds until its pose is sure and accurate, or nothing is left to try."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from time import perf_counter
 from typing import NamedTuple
 
+import numpy as np
 import pycolmap
 
 from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
+from slimsfm.localization.extraction import Extracted, Levels, Seen, Window
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.sight import Sight
@@ -37,10 +39,8 @@ SETTLED = 0.8
 TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
 
-FeatureLevel = Callable[[], Query]
-"""Extracts the features of a query at one size of the image."""
-
 _COARSE_ROUNDS = 4  # of matching, with features of a shrunken image
+_BELIEVED = 0.3  # confidence from which a pose says where to look
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 
@@ -107,25 +107,47 @@ class Search:
         self._sight = Sight(map)
 
     def run(
-        self, levels: Sequence[FeatureLevel], camera: QueryCamera, gravity: Gravity | None = None
+        self,
+        levels: Levels,
+        prepare: Callable[[Extracted], Query],
+        camera: QueryCamera,
+        gravity: Gravity | None = None,
     ) -> SearchResult:
-        """Localize a query by its features, from coarse to fine; stop at the first round that suffices."""
-        rounds: list[RoundResult] = []
-        for query in levels[:-1]:
-            for one in islice(self.rounds(query(), camera, gravity), _COARSE_ROUNDS):
+        """Localize a query by its features, from coarse to fine; stop at the first round that suffices.
+
+        Args:
+            levels: Extracts the features.
+            prepare: Makes a query of them.
+            camera: The intrinsics.
+            gravity: Direction of gravity.
+        """
+        rounds, level = [], next(levels)
+        while True:
+            is_coarse = not level.is_last
+            matching = self.rounds(prepare(level.extracted), camera, gravity)
+            for one in islice(matching, _COARSE_ROUNDS if is_coarse else None):
                 rounds.append(one)
-                if suffices(rounds, is_coarse=True) and not needs_refuting(one):
+                if suffices(rounds, is_coarse=is_coarse) and not needs_refuting(one):
                     return _summed(rounds)
-            if rounds and suffices(rounds, is_coarse=True):  # larger images show no other references
+            if level.is_last:
+                break
+            if suffices(rounds, is_coarse=True):  # a larger image has no more references
                 return _summed(rounds)
-        for one in self.rounds(levels[-1](), camera, gravity):
-            rounds.append(one)
-            if suffices(rounds) and not needs_refuting(one):
-                return _summed(rounds)
+            level = levels.send(self._seen(rounds[-1]))
         is_sure = rounds and rounds[-1].confidence >= SURE
         if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
             rounds.append(self._with_any_focal_length(rounds[-1], camera, gravity))
         return _summed(rounds)
+
+    def _seen(self, last: RoundResult) -> Seen:
+        """Where the map's points are in the image, as far as the pose is believed."""
+        if last.pose is None or last.evidence is None or last.confidence < _BELIEVED:
+            return Seen()
+        agreeing = last.matches.points[last.pose.inliers]
+        points = np.union1d(agreeing, self._strategy.visible_points(last.pose.cam_from_world, agreeing)[1])
+        pixels = project(self._map.points3D_in_world[points], last.pose.cam_from_world, last.camera)
+        window = Window.around(pixels, last.camera.width, last.camera.height)
+        return Seen(window, is_sure=last.evidence.confidence_in_matches >= SURE)
 
     def _with_any_focal_length(
         self, last: RoundResult, camera: QueryCamera, gravity: Gravity | None

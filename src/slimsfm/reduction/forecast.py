@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
+from slimsfm.localization.extraction import SMALLEST_SCALE_PX
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import PointMatches, Target, unite
 from slimsfm.mapping.descriptors import quantize
@@ -32,9 +33,6 @@ from slimsfm.selection.usable_points import LeftOut
 
 Targets = Callable[[str], list[Target]]
 """What a test of this name is matched with."""
-
-SMALLEST_SCALE_PX = 1.0
-"""Scale of the smallest keypoints that SIFT finds."""
 
 _MOST_TESTS = 60
 _LOST = 0.5  # largest share of correct matches that is removed

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slimsfm.localization.extraction import FIRST_SIZES, first_size, image_sizes
+from slimsfm.localization.extraction import FIRST_SIZES, second_size, usual_first_size
 from slimsfm.localization.search import ACCURATE
 from slimsfm.pose import PoseEstimate
 
@@ -64,7 +64,7 @@ class SizeTrials:
 
     def default(self) -> ImageSizes:
         """The sizes for a map that says nothing."""
-        return self._from(first_size(self._whole))
+        return self._from(usual_first_size(self._whole))
 
     def best(self) -> ImageSizes:
         """The sizes that cost least.
@@ -81,7 +81,8 @@ class SizeTrials:
         return min([usual, *smaller, *larger, whole], key=lambda one: one.pixels)
 
     def _from(self, first: int) -> ImageSizes:
-        sizes = image_sizes(self._whole, first)
+        between = second_size(self._whole, first) if first < self._whole else None
+        sizes = tuple(sorted({first, between or first, self._whole}))
         left, ended = np.ones(len(self._tests), bool), np.full(len(self._tests), np.inf)
         reached = []
         for size in sizes:

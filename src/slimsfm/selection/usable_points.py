@@ -8,14 +8,16 @@ that no second image describes, is not usable.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64
 from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, Points2D
 from slimsfm.features import match_nearest, unit_rows
 from slimsfm.geometry import motions, reprojection_errors
+from slimsfm.localization.extraction import SMALLEST_SCALE_PX, usual_first_size
 from slimsfm.localization.point_descriptors import descriptor_sums
 from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import projection_jacobian
@@ -77,26 +79,30 @@ _NEIGHBORS = 20  # other images whose points are matched: those with the most co
 
 
 def selection_problem(map: Map, left_out: LeftOut, progress: ProgressBar = silent) -> SelectionProblem:
-    """Find which points each reference image can use.
+    """Find which points each reference image can use, and which of them the image can use after shrinking.
+
+    Each image counts twice if keypoints have a scale and the extractor an image size: as it is, and as small
+    as the first image that features of a query are extracted from (`localization.extraction`).
 
     Notes:
         Time is linear in the images: each is matched against the points of at most 20 others.
     """
     near = _points_near(map)
     names = list(map.images)
-    found = [
+    uses = [
         _usable(map, left_out, name, points)
         for name, points in zip(progress(names, "find usable points"), near, strict=True)
     ]
-    columns = np.concatenate(found)
-    starts = np.concatenate([[0], np.cumsum([len(points) for points in found])])
+    if "max_image_size" in map.info.extractor_options:
+        uses += [small for name, one in zip(names, uses, strict=True) if (small := _small(map, name, one))]
+        names *= len(uses) // len(names)
+    columns = np.concatenate([one.points for one in uses])
+    starts = np.concatenate([[0], np.cumsum([len(one.points) for one in uses])])
     return SelectionProblem(
         usable=csr_array(
             (np.ones(len(columns), bool), columns, starts), shape=(len(names), len(map.point3D_ids))
         ),
-        twists=np.concatenate(
-            [_twists(map, name, points) for name, points in zip(names, found, strict=True)]
-        ),
+        twists=np.concatenate([_twists(map, name, one) for name, one in zip(names, uses, strict=True)]),
         corner_twists=np.stack([_corner_twists(map, name) for name in names]),
     )
 
@@ -114,8 +120,16 @@ def _points_near(map: Map) -> list[Ids]:
     return near
 
 
-def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.ndarray, " found"]:
-    query = left_out.query(name)
+class _Uses(NamedTuple):
+    """Points that an image can use, ascending."""
+
+    points: Ids
+    scales: Float64[np.ndarray, " n"] | None  # of its keypoints, in pixels
+    shrink_factor: float  # pixels of the image per pixel in which keypoints are found
+
+
+def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> _Uses:
+    query, factor = left_out.query(name), map.shrink_factor(name)
     pairs = match_nearest(query.descriptors, left_out.describe(points, name), map.descriptor_metric)
     matched = points[pairs[:, 1]]
     errors = reprojection_errors(
@@ -124,13 +138,28 @@ def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> Int64[np.nda
         map.images[name].cam_from_world(),
         map.camera(name),
     )
-    return np.sort(matched[errors <= _MAX_ERROR_PX * map.shrink_factor(name)])
+    good = np.flatnonzero(errors <= _MAX_ERROR_PX * factor)
+    good = good[np.argsort(matched[good], kind="stable")]
+    scales = None if query.scales is None else query.scales[pairs[good, 0]]
+    return _Uses(matched[good], scales, factor)
 
 
-def _twists(map: Map, name: str, points: Ids) -> Twists:
+def _small(map: Map, name: str, uses: _Uses) -> _Uses | None:
+    """Those that the image can use when it is shrunk; None if its keypoints have no scales."""
+    if uses.scales is None:
+        return None
+    camera = map.camera(name)
+    longer = max(camera.width, camera.height)
+    whole = min(longer, map.info.extractor_options["max_image_size"])
+    factor = longer / min(usual_first_size(whole), whole)
+    found = uses.scales >= SMALLEST_SCALE_PX * factor
+    return _Uses(uses.points[found], uses.scales[found], factor)
+
+
+def _twists(map: Map, name: str, uses: _Uses) -> Twists:
     """Twists of an ideal pinhole camera: lens distortion hardly changes the information of a match."""
-    in_cam = map.images[name].cam_from_world() * map.points3D_in_world[points]
-    focal_px = map.camera(name).mean_focal_length() / map.shrink_factor(name)
+    in_cam = map.images[name].cam_from_world() * map.points3D_in_world[uses.points]
+    focal_px = map.camera(name).mean_focal_length() / uses.shrink_factor
     twists = projection_jacobian(in_cam, focal_px)
     return (twists * _in_diagonals(map.box.diagonal)).astype(np.float32)
 
