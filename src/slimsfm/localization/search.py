@@ -9,6 +9,7 @@ import pycolmap
 
 from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
+from slimsfm.localization.exact import ExactPass
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
 from slimsfm.localization.sight import Sight
@@ -20,6 +21,9 @@ from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
 
 SURE = 0.95
 """Confidence from which a pose is sure."""
+
+CONVINCING = 0.5
+"""Confidence from which a pose is made exact: matches near a wrong pose are worth nothing."""
 
 MIN_REFUTING = 2
 """Number of images that could have contradicted an ambiguous pose, before the search may stop."""
@@ -97,9 +101,36 @@ class Search:
         self._focal: FocalLength = focal
         self._verifier = Verifier(map, strategy, distinct_points(map))
         self._sight = Sight(map)
+        self._exact = ExactPass(map, strategy)
 
     def run(self, query: Query, camera: QueryCamera, gravity: Gravity | None = None) -> SearchResult:
-        """Localize a query; stop at the first round that suffices."""
+        """Localize a query; stop at the first round that suffices, and make its pose exact."""
+        found, start = self._searched(query, camera, gravity), perf_counter()
+        if found.best.confidence < CONVINCING or gravity is not None:
+            return found
+        best = self._refined(query, found.best)
+        return replace(found, best=best, pose_seconds=found.pose_seconds + perf_counter() - start)
+
+    def _refined(self, query: Query, best: RoundResult) -> RoundResult:
+        """The same pose, more exact: see `ExactPass`."""
+        if best.pose is None or best.evidence is None:
+            return best
+        shrunk = _Shrunk.of(query, best.matches, best.camera)
+        found = self._exact.refined(
+            shrunk.query, shrunk.matches, best.pose, shrunk.camera, self._ransac.max_error_px
+        )
+        if found is None:
+            return best
+        used = found.matches.pixels(shrunk.query)[found.pose.inliers]
+        evidence = self._verifier.determined(best.evidence, found.pose, used, shrunk.camera)
+        return replace(
+            best,
+            matches=found.matches,
+            pose=replace(found.pose, confidence=evidence.confidence),
+            evidence=evidence,
+        )
+
+    def _searched(self, query: Query, camera: QueryCamera, gravity: Gravity | None) -> SearchResult:
         rounds: list[RoundResult] = []
         for one in self.rounds(query, camera, gravity):
             rounds.append(one)
