@@ -100,7 +100,7 @@ class ExactPass:
         return Exact(pose=kept, matches=both)
 
     def _visible(self, cam_from_world: pycolmap.Rigid3d, agreeing: Ids) -> Target:
-        """The points that should be visible, with the descriptors of several images where the map has them."""
+        """The points that should be visible, as several images see them where the strategy knows images."""
         if isinstance(self._strategy, ThroughReferences):
             descriptors, points = self._strategy.references.nearest_points(agreeing, _REFERENCES)
         else:

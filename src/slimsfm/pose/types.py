@@ -199,8 +199,8 @@ def pose_covariance(
     """Covariance of a pose from matches: the inverse of their information, scaled by their residuals.
 
     The variance of a pixel is that of the reprojection errors, but at least that of `MIN_SIGMA_PX`. Where the
-    matches leave a motion of the camera free, for example when all lie on one line, its variance is huge. With
-    spreads, the variance is that of the most exact matches.
+    matches leave a motion of the camera free, for example when all lie on one line, its variance is huge.
+    With spreads, the variance of a pixel is that of the most exact matches.
 
     Args:
         pinhole_points2D: Pixels of an ideal pinhole camera, principal point (0, 0).

@@ -28,9 +28,8 @@ def refine_weighted(
     """Refine a pose by minimizing reprojection errors, each divided by the spread of its match.
 
     The scale of the Cauchy loss is the scatter of the matches at the start, so only the ratios of the spreads
-    matter. PoseLib minimizes the errors; it knows no weights, but several cameras, and the same picture with a
-    focal length and pixels that are k times smaller has errors that are k times smaller. So the matches of
-    about equal spreads get a camera of their own.
+    matter. PoseLib minimizes the errors. It knows no weights, but several cameras, and with focal length and
+    pixels divided by k, errors are k times smaller. So matches of about equal spreads get their own camera.
 
     Args:
         points2D: Pixels; row i matches row i of `points3D_in_world`.
