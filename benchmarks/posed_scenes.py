@@ -2,8 +2,8 @@
 
     python benchmarks/posed_scenes.py FOLDER -o OUT
 
-Maps the images that are no queries by triangulation from their poses, stores the map in OUT/NAME-full and what
-`reduce` makes of it by default in OUT/NAME-slim, and prints the scores of both.
+Maps the images that are no queries by triangulation from their poses, stores the map in OUT/NAME-full and
+what `reduce` makes of it by default in OUT/NAME-slim, and prints the scores of both.
 """
 
 import argparse

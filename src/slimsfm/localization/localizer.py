@@ -65,8 +65,9 @@ class LocalizationOptions:
     correction. approximate: to 30 %. unknown: not at all."""
 
     extraction: ExtractionChoice = "rounds"
-    """Image that features of a query are extracted from: a small version of it first, and a larger one only
-    until the pose is sure and exact (rounds), or the whole one (whole)."""
+    """Image that features of a query are extracted from: a small version of it first, and larger ones only
+    until the pose is sure, which all points near it then make exact (rounds), or the whole image, without that
+    second pass, as in version 0.1 (whole)."""
 
     min_confidence: float = 0.5
     """Poses of lower confidence are discarded: the query counts as not localized."""
@@ -135,7 +136,8 @@ class Localizer:
         self.extractor = self._extractor.whole
         self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
         self._length = descriptor_length(map)
-        self._search = Search(map, self._strategy, options.ransac, options.focal)
+        is_exact = options.extraction == "rounds"
+        self._search = Search(map, self._strategy, options.ransac, options.focal, is_exact=is_exact)
 
     def localize(
         self,

@@ -11,6 +11,7 @@ import pycolmap
 
 from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
+from slimsfm.localization.exact import ExactPass
 from slimsfm.localization.extraction import Extracted, Levels, Seen, Window
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
@@ -23,6 +24,9 @@ from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
 
 SURE = 0.95
 """Confidence from which a pose is sure."""
+
+CONVINCING = 0.5
+"""Confidence from which a pose is made exact: matches near a wrong pose are worth nothing."""
 
 MIN_REFUTING = 2
 """Number of images that could have contradicted an ambiguous pose, before the search may stop."""
@@ -97,14 +101,30 @@ class Search:
     """Searches one map with one strategy."""
 
     def __init__(
-        self, map: Map, strategy: Strategy, ransac: RansacOptions, focal: FocalLength = "auto"
+        self,
+        map: Map,
+        strategy: Strategy,
+        ransac: RansacOptions,
+        focal: FocalLength = "auto",
+        *,
+        is_exact: bool = True,
     ) -> None:
+        """Prepare for a map; the other arguments are those of `LocalizationOptions`.
+
+        Args:
+            map: The map.
+            strategy: How queries are matched.
+            ransac: How poses are estimated.
+            focal: How far focal lengths are believed.
+            is_exact: Whether sure poses are refined by the exact pass.
+        """
         self._map = map
         self._strategy = strategy
         self._ransac = ransac
         self._focal: FocalLength = focal
         self._verifier = Verifier(map, strategy, distinct_points(map))
         self._sight = Sight(map)
+        self._exact, self._is_exact = ExactPass(map, strategy), is_exact
 
     def run(
         self,
@@ -113,7 +133,7 @@ class Search:
         camera: QueryCamera,
         gravity: Gravity | None = None,
     ) -> SearchResult:
-        """Localize a query by its features, from coarse to fine; stop at the first round that suffices.
+        """Localize a query by its features, from coarse to fine, and make its pose exact.
 
         Args:
             levels: Extracts the features.
@@ -121,6 +141,35 @@ class Search:
             camera: The intrinsics.
             gravity: Direction of gravity.
         """
+        found, start = self._searched(levels, prepare, camera, gravity), perf_counter()
+        if not self._is_exact or found.best.confidence < CONVINCING or gravity is not None:
+            return found
+        best = self._refined(found.best)
+        return replace(found, best=best, pose_seconds=found.pose_seconds + perf_counter() - start)
+
+    def _refined(self, best: RoundResult) -> RoundResult:
+        """The same pose, more exact: see `ExactPass`."""
+        if best.pose is None or best.evidence is None:
+            return best
+        shrunk = _Shrunk.of(best.query, best.matches, best.camera)
+        found = self._exact.refined(
+            shrunk.query, shrunk.matches, best.pose, shrunk.camera, self._ransac.max_error_px
+        )
+        if found is None:
+            return best
+        used = found.matches.pixels(shrunk.query)[found.pose.inliers]
+        evidence = self._verifier.determined(best.evidence, found.pose, used, shrunk.camera)
+        pose = replace(found.pose, confidence=evidence.confidence)
+        return replace(best, matches=found.matches, pose=pose, evidence=evidence)
+
+    def _searched(
+        self,
+        levels: Levels,
+        prepare: Callable[[Extracted], Query],
+        camera: QueryCamera,
+        gravity: Gravity | None,
+    ) -> SearchResult:
+        """The first round that suffices, or all rounds."""
         rounds, level = [], next(levels)
         while True:
             is_coarse = not level.is_last

@@ -6,6 +6,7 @@ References:
 """
 
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
@@ -31,17 +32,17 @@ class Exhaustive:
     """
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
-        self._references = ReferenceImages(map, options)
+        self.references = ReferenceImages(map, options)
 
     def rounds(self, query: Query) -> Rounds:
         """Match the query with every reference image, in one round."""
-        yield self._references.match(query)
+        yield self.references.match(query)
 
     def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """The points that one reference image near the pose sees."""
-        return self._references.visible_points(cam_from_world, agreeing)
+        return self.references.visible_points(cam_from_world, agreeing)
 
 
 class Retrieval:
@@ -49,19 +50,19 @@ class Retrieval:
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
         self._retrieved = options.retrieved
-        self._references = ReferenceImages(map, options)
+        self.references = ReferenceImages(map, options)
         self._ranking = ImageRanking(map)
 
     def rounds(self, query: Query) -> Rounds:
         """Match the query with the most similar reference images, in one round."""
-        order = np.argsort(-self._ranking.similarities(self._references.describe(query)), kind="stable")
-        yield self._references.match(query, order[: self._retrieved].tolist())
+        order = np.argsort(-self._ranking.similarities(self.references.describe(query)), kind="stable")
+        yield self.references.match(query, order[: self._retrieved].tolist())
 
     def visible_points(
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """The points that one reference image near the pose sees."""
-        return self._references.visible_points(cam_from_world, agreeing)
+        return self.references.visible_points(cam_from_world, agreeing)
 
 
 class ReferenceImages:
@@ -122,10 +123,27 @@ class ReferenceImages:
         towards = _direction(cam_from_world, self._center)
         return self._matching.target(int((self._directions @ towards).argmax()))
 
+    def nearest_points(self, agreeing: Ids, count: int) -> Target:
+        """What the few images see that see most of some points; a point once per image that sees it."""
+        sharing = self.sharing(agreeing)
+        rows = [row for row in np.argsort(-sharing, kind="stable")[:count].tolist() if sharing[row]]
+        targets = [self._matching.target(row) for row in rows]
+        return np.concatenate([one[0] for one in targets]), np.concatenate([one[1] for one in targets])
+
     def known_from(self, rows: Sequence[int]) -> Float32[np.ndarray, " references"]:
         """The share of each image's points that some images see too."""
         known = (self._sees[list(rows)].sum(axis=0) > 0).astype(np.float32)
         return self._sees @ known / self._counts
+
+
+@runtime_checkable
+class ThroughReferences(Protocol):
+    """A strategy that goes through reference images."""
+
+    @property
+    def references(self) -> ReferenceImages:
+        """The images of its map."""
+        ...
 
 
 def _direction(
@@ -205,7 +223,7 @@ class Progressive:
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:
         self._nearest = map.descriptor_metric
-        self._references = ReferenceImages(map, options)
+        self.references = ReferenceImages(map, options)
         self._ranking = ImageRanking(map)
         landmarks = choose_landmarks(map)
         self._landmarks = unit_rows(descriptor_sums(map))[landmarks], landmarks
@@ -215,23 +233,23 @@ class Progressive:
         parts = [match_target(query.descriptors[:_FIRST], self._landmarks, self._nearest)]
         matches = unite(parts)
         pose = yield matches
-        similarities, tried = self._ranking.similarities(self._references.describe(query)), []
-        while len(tried) < _TRIED * len(self._references):
+        similarities, tried = self._ranking.similarities(self.references.describe(query)), []
+        while len(tried) < _TRIED * len(self.references):
             agreeing = matches.points[pose.inliers] if pose else matches.points
             for _ in range(max(1, round(_GROWTH * len(tried)))):
                 tried.append(self._next(similarities, tried, agreeing))
-                parts.append(self._references.match(query, tried[-1:], _STRONGEST))
+                parts.append(self.references.match(query, tried[-1:], _STRONGEST))
             matches = unite(parts, query.shrink_factor)
             pose = yield matches
-        yield self._references.match(query)
+        yield self.references.match(query)
 
     def _next(self, similarities: Float32[np.ndarray, " references"], tried: list[int], agreeing: Ids) -> int:
         """The most useful image not tried yet: in turn one to confirm the pose and one to refute it."""
         score = similarities.copy()
         if len(tried) % 2 == 0 and len(agreeing):
-            score += self._references.sharing(agreeing) / len(agreeing)
+            score += self.references.sharing(agreeing) / len(agreeing)
         elif tried:
-            score -= self._references.known_from(tried)
+            score -= self.references.known_from(tried)
         score[tried] = -np.inf
         return int(score.argmax())
 
@@ -239,7 +257,7 @@ class Progressive:
         self, cam_from_world: pycolmap.Rigid3d, agreeing: Int64[np.ndarray, " _"] | None = None
     ) -> Target:
         """The points that one reference image near the pose sees."""
-        return self._references.visible_points(cam_from_world, agreeing)
+        return self.references.visible_points(cam_from_world, agreeing)
 
 
 def choose_landmarks(map: Map) -> Ids:

@@ -217,6 +217,23 @@ class Verifier:
             determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
         )
 
+    def determined(
+        self, evidence: Evidence, pose: PoseEstimate, inliers: Points2D, camera: pycolmap.Camera
+    ) -> Evidence:
+        """The evidence for a pose after it was refined over other matches that were looked for near it.
+
+        How well they determine the pose is theirs. What supports and what contradicts it stays, because such
+        matches agree with a wrong pose too.
+        """
+        predicted_error = pose.predicted_corner_error(self._box)
+        return replace(
+            evidence,
+            predicted_error=predicted_error,
+            uncalibrated_error=self._uncalibrated_error(pose),
+            cells=_cells(inliers, camera),
+            determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
+        )
+
     def _determined(self, pose: PoseEstimate) -> float:
         return pose.probability_within(ADD_FRACTIONS[0] * inflation(pose.estimated), self._box)
 

@@ -54,8 +54,8 @@ class PointDescriptors:
     evidence for a pose. None in older maps."""
 
     sizes: Float32[np.ndarray, " n"] | None = None
-    """Size of the pattern that the keypoints of each point describe, in map units: scale in pixels times depth
-    over focal length. None in older maps, and if the extractor estimates no scales."""
+    """Size of the pattern that the keypoints of each point describe, in map units: scale in pixels times
+    depth over focal length. None in older maps, and if the extractor estimates no scales."""
 
     def __getitem__(self, rows: Ids) -> "PointDescriptors":
         """Select points by row, in this order."""

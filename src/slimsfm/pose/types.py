@@ -190,22 +190,30 @@ def projection_jacobian(points3D_in_cam: Points3D, focal_px: float) -> Float64[n
 
 
 def pose_covariance(
-    pinhole_points2D: Points2D, points3D_in_world: Points3D, cam_from_world: pycolmap.Rigid3d, focal_px: float
+    pinhole_points2D: Points2D,
+    points3D_in_world: Points3D,
+    cam_from_world: pycolmap.Rigid3d,
+    focal_px: float,
+    spreads: Float64[np.ndarray, " n"] | None = None,
 ) -> Float64[np.ndarray, "6 6"]:
     """Covariance of a pose from matches: the inverse of their information, scaled by their residuals.
 
     The variance of a pixel is that of the reprojection errors, but at least that of `MIN_SIGMA_PX`. Where the
     matches leave a motion of the camera free, for example when all lie on one line, its variance is huge.
+    With spreads, the variance of a pixel is that of the most exact matches.
 
     Args:
         pinhole_points2D: Pixels of an ideal pinhole camera, principal point (0, 0).
         points3D_in_world: The point matched with each pixel.
         cam_from_world: The pose.
         focal_px: Focal length in pixels.
+        spreads: How much less exact each match is than the most exact ones, at least 1; None: all are equal.
     """
     in_cam = cam_from_world * points3D_in_world
-    jacobian = projection_jacobian(in_cam, focal_px).reshape(-1, 6)
-    squares = np.sum((focal_px * in_cam[:, :2] / in_cam[:, 2:] - pinhole_points2D) ** 2)
+    units = np.ones(len(in_cam)) if spreads is None else spreads
+    jacobian = (projection_jacobian(in_cam, focal_px) / units[:, None, None]).reshape(-1, 6)
+    errors = (focal_px * in_cam[:, :2] / in_cam[:, 2:] - pinhole_points2D) / units[:, None]
+    squares = np.sum(errors**2)
     variance = max(squares / max(2 * len(in_cam) - 6, 1), MIN_SIGMA_PX**2)
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     return variance * (vectors / np.maximum(values, 1e-12 * values[-1])) @ vectors.T
