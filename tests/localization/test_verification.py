@@ -11,7 +11,7 @@ from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
 from slimsfm.localization.search import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
-from slimsfm.localization.strategy import PointMatches
+from slimsfm.localization.strategy import PointMatches, Query
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
 from slimsfm.mapping.map import GlobalDescriptors, observed
 from slimsfm.mapping.support import measure
@@ -85,6 +85,18 @@ def test_a_pose_that_sees_the_surface_from_behind_is_not_believed():
         assert last.evidence.inliers > 50
         assert last.evidence.is_behind == is_behind
         assert (last.pose.confidence < 0.05) == is_behind
+
+
+def query_of_nothing():
+    features = Features(
+        keypoints=np.zeros((0, 2), np.float32),
+        descriptors=np.zeros((0, 128), np.float32),
+        scores=np.zeros(0, np.float32),
+        image_size=(640, 480),
+    )
+    return Query(
+        keypoints=np.zeros((0, 2)), descriptors=features.descriptors, features=features, camera=camera()
+    )
 
 
 def test_a_search_does_not_stop_with_accurate_inliers_in_one_corner():

@@ -14,6 +14,7 @@ from slimsfm.errors import InputError, MapError  # noqa: E402
 from slimsfm.features import Features, unit_rows  # noqa: E402
 from slimsfm.geometry import corner_error, project  # noqa: E402
 from slimsfm.localization.cameras import QueryCamera  # noqa: E402
+from slimsfm.localization.rounds import given_features  # noqa: E402
 from slimsfm.localization.search import Search  # noqa: E402
 from slimsfm.localization.strategies import Direct  # noqa: E402
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy  # noqa: E402
@@ -167,7 +168,9 @@ def errors(matches, of: Query, map_: Map) -> np.ndarray:
 def test_the_scene_is_localized(make, scene, extractor):
     strategy = make(scene)
     believed = QueryCamera(camera=camera(), source="given")
-    found = Search(scene, strategy, RansacOptions()).run(query(scene, extractor), believed).best
+    of = query(scene, extractor)
+    search = Search(scene, strategy, RansacOptions())
+    found = search.run(given_features(of.features, 1.0), lambda _: of, believed).best
     assert corner_error(found.pose.cam_from_world, VIEW, BOX) < 0.01
     assert found.pose.num_inliers > 0.8 * POINTS
     assert found.confidence > 0.9

@@ -17,7 +17,7 @@ from slimsfm.features import Features
 from slimsfm.files import inside
 from slimsfm.geometry import Box, corner_error, rotation_error_deg, translation_error
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
-from slimsfm.localization.extraction import ExtractionChoice
+from slimsfm.localization.rounds import ExtractionChoice
 from slimsfm.localization.strategy import MatchingOptions
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map

@@ -58,7 +58,9 @@ def _nearest_two(
     nearest = np.empty(len(descriptors1), np.int64)
     best, second = np.empty((2, len(descriptors1)), np.float32)
     best_of_column = np.full(len(descriptors2), -np.inf, np.float32)
-    transposed = np.ascontiguousarray(descriptors2.T)
+    transposed = descriptors2.T
+    if len(descriptors1) > _BLOCK:  # for one block the copy takes longer than the product
+        transposed = np.ascontiguousarray(transposed)
     memory = np.empty((_BLOCK, len(descriptors2)), np.float32)  # reused: new pages are expensive
     for start in range(0, len(descriptors1), _BLOCK):
         block = slice(start, start + _BLOCK)

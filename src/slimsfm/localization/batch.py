@@ -11,9 +11,9 @@ from slimsfm.arrays import GrayImage, Image
 from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.image_files import check_names, list_images
 from slimsfm.localization.cameras import QueryCamera, query_camera
-from slimsfm.localization.extraction import ImageRounds
 from slimsfm.localization.localizer import Localizer
 from slimsfm.localization.outcome import Localization
+from slimsfm.localization.rounds import ImageRounds
 from slimsfm.localization.shared_cameras import corrected_cameras, share_cameras
 from slimsfm.photos import Orientation, read_photo
 from slimsfm.pose import Gravity
@@ -61,11 +61,11 @@ class MultiLocalizer:
         Raises:
             ValueError: As in `Localizer.localize`.
         """
-        rounds = ImageRounds(image, mask)
-        return {
-            name: localizer.localize_in_rounds(rounds, (cameras or {}).get(name), gravity)
-            for name, localizer in self.localizers.items()
-        }
+        source, found = ImageRounds(image, mask), {}
+        for name, localizer in self.localizers.items():
+            camera = localizer.camera_of(image, (cameras or {}).get(name))
+            found[name] = localizer.localize_in_rounds(source, camera, gravity)
+        return found
 
 
 _ONLY = ""  # name of the object where there is one map

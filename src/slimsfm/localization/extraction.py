@@ -1,17 +1,9 @@
-"""Features of a query in rounds, from a small version of the image to the whole one.
+"""The extractor of a map, for shrunken images and parts of images, and which sizes these have."""
 
-Most queries are localized by a seventh of their pixels, and extraction takes time in proportion to them. So
-features are extracted from a shrunken image first. If the pose is not sure, a larger image follows, of the
-part where the map's points should be if there is a pose, and finally the whole image. All rounds before the
-last have at most a third of its pixels.
-"""
-
-from collections.abc import Generator
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil, sqrt
-from time import perf_counter
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +12,6 @@ from slimsfm.features import Extractor, Features, load_extractor, shrink_factor
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 from slimsfm.photos import shrink
-
-ExtractionChoice = Literal["rounds", "whole"]
 
 FIRST_SIZES = 128, 160, 200, 240, 280, 320, 360, 400, 480, 560, 640, 800
 """Longer sides of the first image, in pixels, that `reduce` tries."""
@@ -92,39 +82,6 @@ class Extracted(NamedTuple):
     """Pixels of the image per pixel in which they were found."""
 
 
-class Level(NamedTuple):
-    """Features of one round of extraction."""
-
-    extracted: Extracted
-    """The features."""
-
-    is_last: bool
-    """Whether no more features follow."""
-
-
-class Seen(NamedTuple):
-    """What a search has found with the features of a level."""
-
-    window: Window | None = None
-    """Where the points of the map should be, if there is a pose that is believed."""
-
-    is_sure: bool = False
-    """Whether the pose is sure, and only not exact enough."""
-
-    def share(self, width: int, height: int) -> float:
-        """Share of an image that the window covers."""
-        return 1.0 if self.window is None else self.window.area / (width * height)
-
-
-Levels = Generator[Level, Seen, None]
-"""Yields features, finer ones or more of them in each round; is sent what was found with the last ones."""
-
-
-def given_features(features: Features, factor: float) -> Levels:
-    """The one level of features that have been extracted; `factor` is their `Extracted.shrink_factor`."""
-    yield Level(Extracted(features, factor), is_last=True)
-
-
 class SizedExtractor:
     """The extractor of a map, for images of several sizes.
 
@@ -182,48 +139,3 @@ class SizedExtractor:
 
     def _with_size(self, size: int) -> Extractor:
         return load_extractor(self.whole.name, {**self.whole.options, "max_image_size": size})
-
-
-class ImageRounds:
-    """Features of one image, from coarse to fine; each size of the whole image is extracted once.
-
-    Attributes:
-        image: The image.
-        seconds: Wall time of all extractions so far.
-    """
-
-    def __init__(self, image: Image, mask: GrayImage | None = None) -> None:
-        self.image, self._mask = image, mask
-        self._extracted: dict[tuple[str, int], Extracted] = {}
-        self.seconds = 0.0
-
-    def levels(self, extractor: SizedExtractor, choice: ExtractionChoice) -> Levels:
-        """Extract features for one map; see `Levels`."""
-        height, width = self.image.shape[:2]
-        whole = extractor.whole_size(width, height)
-        first = whole if choice == "whole" else extractor.first_size(width, height)
-        if first < whole:
-            seen = yield Level(self._at(extractor, first), is_last=False)
-            if size := second_size(whole, first, seen.share(width, height)):
-                seen = yield Level(self._part(extractor, size, seen.window), is_last=False)
-            if seen.is_sure and seen.window:
-                yield Level(self._part(extractor, whole, seen.window), is_last=True)
-                return
-        yield Level(self._at(extractor, whole), is_last=True)
-
-    def _at(self, extractor: SizedExtractor, size: int) -> Extracted:
-        """The features at a size; extracts them unless an equal extractor has done it."""
-        key = extractor.key, size
-        if key not in self._extracted:
-            start = perf_counter()
-            self._extracted[key] = extractor.extract(self.image, self._mask, size)
-            self.seconds += perf_counter() - start
-        return self._extracted[key]
-
-    def _part(self, extractor: SizedExtractor, size: int, window: Window | None) -> Extracted:
-        if window is None:
-            return self._at(extractor, size)
-        start = perf_counter()
-        found = extractor.extract_part(self.image, self._mask, size, window)
-        self.seconds += perf_counter() - start
-        return found

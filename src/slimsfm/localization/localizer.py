@@ -17,15 +17,16 @@ from slimsfm.localization.cameras import (
     QueryCamera,
     camera_in_memory,
 )
-from slimsfm.localization.extraction import (
-    Extracted,
-    ExtractionChoice,
-    ImageRounds,
-    SizedExtractor,
-    given_features,
-)
+from slimsfm.localization.extraction import Extracted, SizedExtractor
 from slimsfm.localization.matching import extract_near
 from slimsfm.localization.outcome import Localization, Seconds
+from slimsfm.localization.rounds import (
+    ExtractionChoice,
+    FeatureSource,
+    ImageRounds,
+    given_features,
+    levels_of,
+)
 from slimsfm.localization.search import RoundResult, Search, SearchResult
 from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
 from slimsfm.mapping.descriptors import descriptor_length
@@ -66,7 +67,7 @@ class LocalizationOptions:
 
     extraction: ExtractionChoice = "rounds"
     """Image that features of a query are extracted from: a small version of it first, and larger ones only
-    until the pose is sure, which all points near it then make exact (rounds), or the whole image, without that
+    until the pose is sure, which all points near it make exact (rounds), or the whole image, without that
     second pass, as in version 0.1 (whole)."""
 
     min_confidence: float = 0.5
@@ -159,24 +160,25 @@ class Localizer:
             ValueError: The camera has another image size or is impossible, or none is given and the map's
                 does not fit.
         """
-        return self.localize_in_rounds(ImageRounds(image, mask), camera, gravity)
+        return self.localize_in_rounds(ImageRounds(image, mask), self.camera_of(image, camera), gravity)
 
     def localize_in_rounds(
-        self,
-        rounds: ImageRounds,
-        camera: pycolmap.Camera | QueryCamera | None = None,
-        gravity: Gravity | None = None,
+        self, source: FeatureSource, camera: QueryCamera, gravity: Gravity | None = None
     ) -> Localization:
-        """Localize one image like `localize`, by features that localizers of several maps share.
+        """Localize one image like `localize`, by features that localizers of several maps may share.
 
         The time of an extraction counts for the localizer that is the first to need it.
+
+        Args:
+            source: Extracts features of the image.
+            camera: Its intrinsics, by `camera_of`.
+            gravity: As in `localize`.
         """
-        image, before = rounds.image, rounds.seconds
-        camera = self.camera_of(image, camera)
+        before = source.seconds
         choice = "whole" if self.looks_at_images else self.options.extraction
-        levels = rounds.levels(self._extractor, choice)
-        found = self._search.run(levels, self._preparing(camera, image), camera, gravity)
-        return self._localization(found, camera, rounds.seconds - before)
+        levels = levels_of(source, self._extractor, choice)
+        found = self._search.run(levels, self._preparing(camera, source.image), camera, gravity)
+        return self._localization(found, camera, source.seconds - before)
 
     def _preparing(self, camera: QueryCamera, image: Image | None = None) -> Callable[[Extracted], Query]:
         return lambda one: self._query(one.features, camera.camera, one.shrink_factor, image)

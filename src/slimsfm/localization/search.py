@@ -12,9 +12,10 @@ import pycolmap
 from slimsfm.geometry import project, resized_camera
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
 from slimsfm.localization.exact import ExactPass
-from slimsfm.localization.extraction import Extracted, Levels, Seen, Window
+from slimsfm.localization.extraction import Extracted, Window
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import distinct_points
+from slimsfm.localization.rounds import Levels, Seen
 from slimsfm.localization.sight import Sight
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
 from slimsfm.localization.verification import Evidence, Verifier, inflation
@@ -182,7 +183,10 @@ class Search:
                 break
             if suffices(rounds, is_coarse=True):  # a larger image has no more references
                 return _summed(rounds)
-            level = levels.send(self._seen(rounds[-1]))
+            try:
+                level = levels.send(self._seen(rounds[-1]))
+            except StopIteration:
+                return _summed(rounds)
         is_sure = rounds and rounds[-1].confidence >= SURE
         if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
             rounds.append(self._with_any_focal_length(rounds[-1], camera, gravity))

@@ -11,6 +11,7 @@ from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.mapping.map import Map, PointDescriptors
 from slimsfm.mapping.subset import direct_map, keep_images
 from slimsfm.reduction.forecast import Prediction
+from slimsfm.reduction.image_size import SizeTrials
 
 DOMINATING = "dominating"
 """The method that keeps a dominating set of the images."""
@@ -72,6 +73,9 @@ class Candidate:
 
     full: Prediction
     """How the full map localizes the same references."""
+
+    sizes: SizeTrials | None = None
+    """Tries image sizes for the queries; None if the extractor has no image size or no scales."""
 
     @cached_property
     def losses(self) -> tuple[float, ...]:

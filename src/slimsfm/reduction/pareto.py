@@ -131,9 +131,19 @@ def _predicted(
     full = trials.full(trials.tests, progress)
     candidates = []
     for choice, size in zip(progress(choices, "predict losses"), sizes, strict=True):
-        prediction = trials.images(choice.images) if choice.use == "images" else trials.points(choice.points)
-        full_part = full.of(prediction.tests)
-        candidates.append(Candidate(choice=choice, bytes=size, prediction=prediction, full=full_part))
+        if choice.use == "images":
+            prediction, targets = trials.images(choice.images), trials.image_targets(choice.images)
+        else:
+            prediction, targets = trials.points(choice.points), trials.point_targets(choice.points)
+        candidates.append(
+            Candidate(
+                choice=choice,
+                bytes=size,
+                prediction=prediction,
+                full=full.of(prediction.tests),
+                sizes=trials.sizes(targets),
+            )
+        )
     return full, tuple(candidates)
 
 
@@ -192,7 +202,13 @@ def forecast_images(
     )
     prediction = trials.images(images)
     full = trials.full(prediction.tests, progress)
-    return Candidate(choice=choice, bytes=weigh_map(slim), prediction=prediction, full=full)
+    return Candidate(
+        choice=choice,
+        bytes=weigh_map(slim),
+        prediction=prediction,
+        full=full,
+        sizes=trials.sizes(trials.image_targets(images)),
+    )
 
 
 def _choices(

@@ -259,7 +259,7 @@ def reduce(
         reduced = replace(reduced, forecast={**reduced.forecast, **taken})
     for use, one in reduced.forecast.items():
         _check_localizes(use, one)
-    return replace(reduced, map=_kept(map, reduced.forecast))
+    return replace(reduced, map=_with_first_image_size(_kept(map, reduced.forecast), reduced.forecast))
 
 
 def _check_localizes(use: str, one: Candidate) -> None:
@@ -342,6 +342,12 @@ def _within(
                 f"{len(one.point3D_ids)} points and {weigh_map(one)} bytes"
             )
     return names
+
+
+def _with_first_image_size(map: Map, forecast: Mapping[str, Candidate]) -> Map:
+    """The map, knowing which image to extract the first features of queries from."""
+    found = [one.sizes.best().sizes[0] for one in forecast.values() if one.sizes]
+    return replace(map, info=replace(map.info, first_image_size=max(found, default=None)))
 
 
 def _kept(map: Map, forecast: Mapping[str, Candidate]) -> Map:
