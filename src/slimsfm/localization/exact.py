@@ -171,7 +171,7 @@ def _unambiguous(
     elsewhere = np.einsum("pki,pki->pk", shifts, shifts) > _SAME_PX**2
     rivals = np.where(elsewhere, cosines, -1).max(axis=1)
     angles, others = (np.arccos(np.clip(one, -1, 1)) for one in (cosines[rows, best], rivals))
-    return np.flatnonzero((angles <= _ALIKE * metric.max_distance) & (angles <= _MAX_RATIO * others))
+    return np.flatnonzero((angles <= _ALIKE * metric.max_distance) & (angles < _MAX_RATIO * others))
 
 
 def _once(keypoints: Ids, points: Ids, cosines: Float32[np.ndarray, " n"]) -> PointMatches:
