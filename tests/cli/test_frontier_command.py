@@ -59,7 +59,8 @@ def test_the_figures_say_what_the_table_says(boulder, drawn):
         assert bool(one["images"]) == (one["for"] == "images")
         assert one["tests"] == MAPPING_FRAMES - len(one["images"])
         assert 0 <= one["add_0.02d"] <= one["add_0.05d"] <= one["add_0.1d"] <= 100
-        assert one["ms"] > 0
+        assert min(one["ms_extract"], one["ms_match"], one["ms_pose"]) > 0
+        assert one["ms"] == pytest.approx(one["ms_extract"] + one["ms_match"] + one["ms_pose"])
         assert 0 < one["median_corner_error"] <= one["p90_corner_error"]
         floor = full["finest_corner_error"]
         grown = max(one["median_corner_error"], floor) / max(full["median_corner_error"], floor)

@@ -76,6 +76,7 @@ def test_without_options_it_keeps_points_for_direct_matching(boulder, pointed):
     assert "after 40 % hidden of what the full map does, with a median corner error of " in promise
     assert " times the full map's (measured on " in promise
     assert f"(measured on {MAPPING_FRAMES} images left out)" in promise
+    assert speed.startswith("a whole query, from pixels to pose: ")
     assert " than exhaustive on the full map (" in speed
     assert " than progressive, the default of localize, on the full map (" in speed
     assert last.startswith(f"{pointed.path}: written in ")

@@ -8,6 +8,7 @@ import pytest
 
 from scenes import exact_map
 from slimsfm.features import unit_rows
+from slimsfm.localization import Seconds
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import Prediction, Trials
 from slimsfm.reduction.disturbance import ROUGH
@@ -45,7 +46,7 @@ def strangers(exact):
 def timed_trials(map_):
     """Trials whose clock says that every stage of every test takes one second."""
     ticks = count()
-    return Trials(map_, LeftOut(map_), clock=lambda: float(next(ticks)))
+    return Trials(map_, LeftOut(map_), extract_seconds=5.0, clock=lambda: float(next(ticks)))
 
 
 def prediction(errors, inliers=None):
@@ -53,9 +54,15 @@ def prediction(errors, inliers=None):
         tests=tuple(f"{i}.png" for i in range(len(errors))),
         errors=np.array(errors, np.float64),
         inliers=np.array(inliers if inliers is not None else [9] * len(errors), np.int64),
-        seconds=0.5,
+        seconds=Seconds(extract=0.3, match=0.1, pose=0.1),
         rough_errors=np.zeros((len(errors), 0)),
     )
+
+
+def test_the_90th_percentile_counts_what_has_no_pose():
+    assert prediction([*np.arange(1, 11) / 100, np.inf]).p90_error == pytest.approx(0.1)
+    assert prediction([*np.arange(1, 10) / 100, np.inf, np.inf]).p90_error == np.inf
+    assert prediction([]).p90_error == np.inf
 
 
 def test_shares_count_errors_below_a_fraction():
@@ -93,7 +100,8 @@ def test_on_an_exact_scene_all_errors_are_zero(exact):
         assert found.errors.max() < 1e-4
         assert found.within(0.02) == 100.0
         assert found.inliers.min() >= (LOST_AT_MOST - 0.15) * len(exact.point3D_ids)
-        assert found.seconds > 0
+        assert min(found.seconds.match, found.seconds.pose) > 0
+        assert np.isnan(found.seconds.total)  # nobody said how long extraction takes
 
 
 def test_a_reference_does_not_help_to_localize_itself(strangers):
@@ -111,12 +119,14 @@ def test_only_some_are_left_out_where_there_are_many():
     assert (trials.tests[0], trials.tests[-1]) == (names[0], names[-1])
     by_images = trials.images(names[:30]).tests
     assert set(by_images) == set(trials.tests) - set(names[:30])
-    assert trials.points(rows_of(many)).seconds == 2
-    assert trials.full(trials.tests[:3]).seconds == pytest.approx(2 * 69 / 60)
+    assert trials.points(rows_of(many)).seconds == Seconds(extract=5.0, match=1.0, pose=1.0)
+    scaled = trials.full(trials.tests[:3]).seconds
+    assert (scaled.extract, scaled.match, scaled.pose) == pytest.approx((5.0, 69 / 60, 69 / 60))
 
 
 def test_the_time_of_a_full_map_is_measured_where_images_are_few(exact):
-    assert timed_trials(exact).full(list(exact.images)[:2]).seconds == 2
+    found = timed_trials(exact).full(list(exact.images)[:2])
+    assert found.seconds == Seconds(extract=5.0, match=1.0, pose=1.0)
 
 
 def test_equal_maps_give_equal_predictions(partial):
@@ -132,6 +142,14 @@ def test_equal_maps_give_equal_predictions(partial):
         assert a.tests == b.tests
         assert np.array_equal(a.errors, b.errors)
         assert np.array_equal(a.inliers, b.inliers)
+
+
+def test_the_finest_error_is_half_a_pixel_at_the_distance_of_the_points(exact):
+    camera, diagonal = exact.camera(next(iter(exact.images))), exact.box.diagonal
+    distances = [np.linalg.norm(image.projection_center()) for image in exact.images.values()]
+    found = trials_of(exact).points(rows_of(exact)).finest_error
+    expected = 0.5 * np.median(distances) / (camera.mean_focal_length() * diagonal)
+    assert found == pytest.approx(expected, rel=0.05)
 
 
 def test_rough_queries_are_predicted_only_on_request(partial):

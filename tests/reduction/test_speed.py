@@ -15,10 +15,12 @@ def full():
 
 
 def test_points_are_compared_with_both_ways_to_match_the_full_map(full):
-    found = measure_speed(full, direct_map(full, describe_points(full)[np.arange(60)]))
+    found = measure_speed(full, direct_map(full, describe_points(full)[np.arange(60)]), 0.25)
     assert found.strategy == "progressive"
     assert found.tests == len(full.images) // 4
-    assert min(found.slim, found.exhaustive, found.default) > 0
+    for one in (found.slim, found.exhaustive, found.default):
+        assert one.extract == 0.25
+        assert min(one.match, one.pose) > 0
 
 
 def test_images_that_are_kept_are_no_queries(full):

@@ -48,7 +48,7 @@ class LimitArguments:
     """Largest size on disk, such as 100kB."""
 
     max_ms: float | None = None
-    """Longest time of matching and pose per query on this machine, in milliseconds."""
+    """Longest time of a whole query on this machine, from decoded pixels to pose, in milliseconds."""
 
     max_points: int | None = None
     """Largest number of points."""
@@ -185,5 +185,6 @@ def reduce(
     print_change(map, full, output, reduced.map)
     for one in reduced.forecast.values():
         console.print(f"{one.choice.method} ({one.choice.detail}): {promise(map, full, one)}")
-    print_speed(full, reduced.map)
+    seconds = [one.prediction.seconds for one in reduced.forecast.values()]
+    print_speed(full, reduced.map, seconds[0].extract)
     finish(f"{output}: written", watch, "localize", output, "IMAGES", "-o", "poses.json")

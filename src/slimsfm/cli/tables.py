@@ -16,6 +16,7 @@ from slimsfm.evaluation.results import ObjectResult
 from slimsfm.evaluation.table import BY_FRAME, Row, brief_columns, is_metric
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions, ReferenceGraph, load_or_compute_graph
+from slimsfm.localization import Seconds
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
 from slimsfm.progress import shown
@@ -126,23 +127,42 @@ def _share(part: float, whole: float) -> str:
     return f"{min(100 * part / whole, 100) if whole else 0:.3g} %"
 
 
-def print_speed(full: Map, slim: Map, use: str = "") -> None:
+def print_speed(full: Map, slim: Map, extract_seconds: float, use: str = "") -> None:
     """Measure and print how much faster queries are with a reduced map than with the full one."""
-    speed = measure_speed(full, slim) if full.has_keypoints else None
+    speed = measure_speed(full, slim, extract_seconds) if full.has_keypoints else None
     if speed is None:
         return
     ways = [(speed.exhaustive, "exhaustive")]
     if speed.strategy != "exhaustive":
         ways.append((speed.default, f"{speed.strategy}, the default of localize,"))
-    compared = ", ".join(
-        f"{format_ratio(seconds / speed.slim, 'faster', 'slower')} than {way} on the full map "
-        f"({1e3 * seconds:.3g} ms)"
-        for seconds, way in ways
+    whole = np.isfinite(extract_seconds)
+    compared = ", ".join(_faster(speed.slim, seconds, way, whole=whole) for seconds, way in ways)
+    ours = speed.slim.total if whole else _matching(speed.slim)
+    what = f"a whole query{use}, from pixels to pose" if whole else f"matching and pose{use}"
+    stages = (
+        f" (extract {_ms(extract_seconds)}, match and pose {_ms(_matching(speed.slim))})" if whole else ""
     )
     console.print(
-        f"matching and pose{use}: {1e3 * speed.slim:.3g} ms, {compared}; "
-        f"medians of {plural(speed.tests, 'image')} left out, without extraction of features"
+        f"{what}: {_ms(ours)} ms{stages}, {compared}; medians of {plural(speed.tests, 'image')} left out"
+        + ("" if whole else ", without extraction of features, whose extractor is not available")
     )
+
+
+def _faster(slim: Seconds, full: Seconds, way: str, *, whole: bool) -> str:
+    """How much faster a query is, as a whole if extraction is known, and in matching and pose alone."""
+    alone = format_ratio(_matching(full) / _matching(slim), "faster", "slower")
+    if not whole:
+        return f"{alone} than {way} on the full map ({_ms(_matching(full))} ms)"
+    ratio = format_ratio(full.total / slim.total, "faster", "slower")
+    return f"{ratio} than {way} on the full map ({_ms(full.total)} ms; match and pose alone {alone})"
+
+
+def _matching(seconds: Seconds) -> float:
+    return seconds.match + seconds.pose
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.3g}"
 
 
 def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], full_bytes: int) -> None:
@@ -152,7 +172,7 @@ def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], ful
         table.add_column(column)
     for column in ("images", "points", "size", *(f"{fraction}d" for fraction in ADD_FRACTIONS)):
         table.add_column(column, justify="right")
-    for column in ("loss", "rough loss", "median", "p90", "growth", "match+pose", ""):
+    for column in ("loss", "rough loss", "median", "p90", "growth", "match+pose", "query", ""):
         table.add_column(column, justify="right" if column else "left")
     full = _figures(frontier.full, 0.0, 0.0 if frontier.full.rough_errors.size else None, "")
     table.add_row("", "full map", "exhaustive", "", "", size(full_bytes), *full)
@@ -175,7 +195,8 @@ def print_frontier(frontier: Frontier, recommended: Mapping[str, Candidate], ful
         "lost against the full map on the same images, the largest of the three; rough loss: within 0.1d, "
         f"the largest of {' and '.join(one.name for one in ROUGH)}; median, p90: median and 90th "
         "percentile of the corner error; growth: factors of both against the full map, where errors below "
-        f"{frontier.full.finest_error:.2g}d, half a pixel, count as this; match+pose: median per query; "
+        f"{frontier.full.finest_error:.2g}d, half a pixel, count as this; match+pose: ms, median per "
+        "query; query: ms from pixels to pose, with extraction; "
         "Pareto-dominated: another choice for the same use is not larger and loses no more",
         style="dim",
     )
@@ -189,7 +210,9 @@ def _figures(prediction: Prediction, loss: float, rough_loss: float | None, grow
     shares = [f"{prediction.within(fraction):.1f}" for fraction in ADD_FRACTIONS]
     losses = [f"{loss:.1f}", "" if rough_loss is None else f"{rough_loss:.1f}"]
     errors = [f"{error:.4f}d" for error in (prediction.median_error, prediction.p90_error)]
-    return [*shares, *losses, *errors, growth, f"{1e3 * prediction.seconds:.2f} ms"]
+    seconds = prediction.seconds
+    whole = f"{1e3 * seconds.total:.1f}" if np.isfinite(seconds.total) else ""
+    return [*shares, *losses, *errors, growth, f"{1e3 * _matching(seconds):.2f}", whole]
 
 
 def _remark(
@@ -239,7 +262,10 @@ def _prediction_to_json(prediction: Prediction) -> dict:
         "median_corner_error": _finite(prediction.median_error),
         "p90_corner_error": _finite(prediction.p90_error),
         "finest_corner_error": prediction.finest_error,
-        "ms": 1e3 * prediction.seconds,
+        "ms": _finite(1e3 * prediction.seconds.total),
+        "ms_extract": _finite(1e3 * prediction.seconds.extract),
+        "ms_match": 1e3 * prediction.seconds.match,
+        "ms_pose": 1e3 * prediction.seconds.pose,
     }
 
 

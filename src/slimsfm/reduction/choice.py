@@ -109,8 +109,8 @@ class Candidate:
 
     @property
     def seconds(self) -> float:
-        """Predicted time of matching and pose per query."""
-        return self.prediction.seconds
+        """Predicted time of a whole query, from decoded pixels to pose; NaN if extraction is not known."""
+        return self.prediction.seconds.total
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
+from slimsfm.localization import Seconds
 from slimsfm.localization.extraction import SMALLEST_SCALE_PX
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import PointMatches, Target, unite
@@ -52,8 +53,8 @@ class Prediction:
     inliers: Ids
     """Number of inliers of each test; 0 without a pose."""
 
-    seconds: float
-    """Median time of matching and pose per query."""
+    seconds: Seconds
+    """Median time of each stage per query; NaN for an extraction that is not known."""
 
     rough_errors: Float64[np.ndarray, "tests disturbances"]
     """Relative corner error of each test after each disturbance; no columns if none was tried."""
@@ -97,7 +98,8 @@ class Prediction:
 class _Trial:
     error: float
     inliers: int
-    seconds: float
+    match_seconds: float
+    pose_seconds: float
     rough: tuple[float, ...]
 
 
@@ -108,6 +110,7 @@ class Trials:
         map: The full map.
         left_out: The map without each of its images.
         conditions: Which queries to predict.
+        extract_seconds: Time of extracting the features of a query; NaN if it is not known.
         clock: Measures matching and pose, in seconds.
     """
 
@@ -117,12 +120,14 @@ class Trials:
         left_out: LeftOut,
         *,
         conditions: Conditions = "rough",
+        extract_seconds: float = np.nan,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         self._map = map
         self._left_out = left_out
         self._matching = map.descriptor_metric
         self._disturbances = ROUGH if conditions == "rough" else ()
+        self._extract_seconds = extract_seconds
         self._clock = clock
         names = list(map.images)
         most = _MOST_TESTS if map.has_keypoints else 0  # a query has no descriptors
@@ -152,11 +157,14 @@ class Trials:
     def full(self, tests: Collection[str], progress: ProgressBar = silent) -> Prediction:
         """Match some of the tests against all other references.
 
-        If there are more than 60, only the nearest are matched, and the time is scaled up.
+        If there are more than 60, only the nearest are matched, and the times of matching and pose are scaled
+        up.
         """
         used = min(_MOST_REFERENCES, len(self._map.images) - 1)
         found = self._predict(progress(list(tests), "localize with the full map"), self._nearest)
-        return replace(found, seconds=found.seconds * (len(self._map.images) - 1) / max(used, 1))
+        factor = (len(self._map.images) - 1) / max(used, 1)
+        seconds = replace(found.seconds, match=factor * found.seconds.match, pose=factor * found.seconds.pose)
+        return replace(found, seconds=seconds)
 
     def _predict(self, tests: Iterable[str], targets: Targets) -> Prediction:
         names, found = [], []
@@ -168,7 +176,11 @@ class Trials:
             tests=tuple(names),
             errors=np.array([one.error for one in found], np.float64),
             inliers=np.array([one.inliers for one in found], np.int64),
-            seconds=float(np.median([one.seconds for one in found])) if found else 0.0,
+            seconds=Seconds(
+                extract=self._extract_seconds,
+                match=float(np.median([one.match_seconds for one in found] or [0.0])),
+                pose=float(np.median([one.pose_seconds for one in found] or [0.0])),
+            ),
             rough_errors=np.array([one.rough for one in found], np.float64).reshape(
                 len(found), len(self._disturbances)
             ),
@@ -179,17 +191,18 @@ class Trials:
         start = self._clock()
         query = self._left_out.query(name)
         matches = unite([match_target(query.descriptors, target, self._matching) for target in targets])
-        seconds = self._clock() - start
+        match_seconds = self._clock() - start
         # limits in pixels are for those in which features were found
         matched = self._matched(name, matches, self._map.shrink_factor(name))
         start = self._clock()
         pose = matched.pose(matched.kept, matched.keypoints.pixels[matched.rows])
-        seconds += self._clock() - start
+        pose_seconds = self._clock() - start
         rough = [matched.disturbed_pose(one, self.tests.index(name)) for one in self._disturbances]
         return _Trial(
             error=self._error(name, pose),
             inliers=pose.num_inliers if pose else 0,
-            seconds=seconds,
+            match_seconds=match_seconds,
+            pose_seconds=pose_seconds,
             rough=tuple(self._error(name, one) for one in rough),
         )
 

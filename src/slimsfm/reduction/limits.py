@@ -39,7 +39,7 @@ class ReductionLimits:
     """Largest size of the map on disk, in bytes."""
 
     max_ms: float | None = None
-    """Longest time of matching and pose per query on this machine, in milliseconds."""
+    """Longest time of a whole query on this machine, from decoded pixels to pose, in milliseconds."""
 
     max_points: int | None = None
     """Largest number of points."""
@@ -182,7 +182,8 @@ def _effect(one: Candidate) -> str:
     rough = "" if one.rough_loss is None else f" ({one.rough_loss:.1f} on rough queries)"
     return (
         f"loses {one.loss:.1f} points{rough}, has a corner error of {one.prediction.p90_error:.2g}d (90th "
-        f"percentile), {one.growth.p90:.2g} times the full map's, and takes {1e3 * one.seconds:.2g} ms"
+        f"percentile), {one.growth.p90:.2g} times the full map's, and takes {1e3 * one.seconds:.3g} ms, "
+        f"{1e3 * one.prediction.seconds.extract:.3g} of them for extraction"
     )
 
 

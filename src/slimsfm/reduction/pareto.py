@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slimsfm.errors import InputError, MapError
+from slimsfm.errors import InputError, MapError, SlimsfmError
 from slimsfm.graph import GraphOptions, ReferenceGraph, compute_graph
 from slimsfm.graph.edge_sources import Edges
 from slimsfm.localization.point_descriptors import describe_points
@@ -22,6 +22,7 @@ from slimsfm.reduction.choice import (
     points_seen,
 )
 from slimsfm.reduction.disturbance import Conditions, check_conditions
+from slimsfm.reduction.extraction_time import extraction_seconds
 from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.image_sets import DominatingSetOptions, dominating_set
 from slimsfm.reduction.limits import ReductionLimits, check_reachable
@@ -101,6 +102,7 @@ def frontier(
         InputError: The map has fewer than two images, or no choice can meet the limits on bytes, points and
             images; the nearest choice is named, and nothing has been predicted yet.
         MapError: The map has no features, or was built without a detector.
+        SlimsfmError: `limits` has a time, but the map's extractor cannot be loaded.
     """
     check_reducible(map)
     if not map.has_keypoints:
@@ -120,7 +122,8 @@ def frontier(
     ]
     for use in options.uses:
         check_reachable(choices, sizes, use, limits)
-    trials = Trials(map, left_out, conditions=options.conditions)
+    extract_seconds = _extract_seconds(map, limits)
+    trials = Trials(map, left_out, conditions=options.conditions, extract_seconds=extract_seconds)
     full, candidates = _predicted(trials, choices, sizes, progress)
     return Frontier(full=full, candidates=candidates, bytes=weigh_map(map), diagonal=map.box.diagonal)
 
@@ -145,6 +148,18 @@ def _predicted(
             )
         )
     return full, tuple(candidates)
+
+
+def _extract_seconds(map: Map, limits: ReductionLimits) -> float:
+    """Time of extraction; NaN where the extractor is not available and no limit depends on it."""
+    if not map.has_keypoints:
+        return np.nan
+    try:
+        return extraction_seconds(map)
+    except SlimsfmError:
+        if limits.max_ms is not None:
+            raise
+        return np.nan
 
 
 def check_reducible(map: Map) -> None:
@@ -192,7 +207,9 @@ def forecast_images(
     """
     images = tuple(sorted(set(names)))
     slim = keep_images(map, images)
-    trials = Trials(map, LeftOut(map), conditions=conditions)
+    trials = Trials(
+        map, LeftOut(map), conditions=conditions, extract_seconds=_extract_seconds(map, ReductionLimits())
+    )
     choice = Choice(
         use="images",
         method=method,

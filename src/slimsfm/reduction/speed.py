@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.localization import LocalizationOptions, Localizer, Seconds
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
 
@@ -15,15 +15,15 @@ _SHARE_TESTED = 0.25  # of the images, at most
 
 @dataclass(frozen=True, kw_only=True)
 class Speed:
-    """Median times of matching and pose per query, in seconds. Extraction of features is not included."""
+    """Median time of each stage of a query. That of extraction is the same; NaN if it is not known."""
 
-    slim: float
+    slim: Seconds
     """With the reduced map."""
 
-    exhaustive: float
+    exhaustive: Seconds
     """With the full map, matched with all of its images."""
 
-    default: float
+    default: Seconds
     """With the full map, matched by the strategy that `localize` uses by default."""
 
     strategy: str
@@ -33,14 +33,16 @@ class Speed:
     """Number of queries."""
 
 
-def measure_speed(map: Map, slim: Map) -> Speed | None:
+def measure_speed(map: Map, slim: Map, extract_seconds: float = np.nan) -> Speed | None:
     """Localize some images of a map with a reduced one and, without these images, with the full one.
 
-    The three ways take turns at each query, so that whatever else the machine does slows all of them.
+    The three ways take turns at each query, so that whatever else the machine does slows all of them. The
+    images are localized by their features in the map.
 
     Args:
         map: The full map, with features.
         slim: A map that it was reduced to.
+        extract_seconds: Time of extracting the features of an image; NaN if it is not known.
 
     Returns:
         The times; None if no image can be left out of both maps.
@@ -60,16 +62,19 @@ def measure_speed(map: Map, slim: Map) -> Speed | None:
     with threadpool_limits(1):
         _seconds(ways, map, tests[0])  # the first query also pays for what is only done once
         medians = np.median([_seconds(ways, map, name) for name in tests], axis=0).tolist()
+    slim_seconds, exhaustive, usual = (
+        Seconds(extract=extract_seconds, match=match, pose=pose) for match, pose in medians
+    )
     return Speed(
-        slim=medians[0],
-        exhaustive=medians[1],
-        default=medians[2],
+        slim=slim_seconds,
+        exhaustive=exhaustive,
+        default=usual,
         strategy=default.strategy_for(full),
         tests=count,
     )
 
 
-def _seconds(ways: tuple[Localizer, ...], map: Map, name: str) -> list[float]:
-    """Time of matching and pose of an image with each localizer."""
+def _seconds(ways: tuple[Localizer, ...], map: Map, name: str) -> list[tuple[float, float]]:
+    """Times of matching and pose of an image with each localizer."""
     found = [one.localize_features(map.features[name], map.camera(name)).seconds for one in ways]
-    return [one.match + one.pose for one in found]
+    return [(one.match, one.pose) for one in found]

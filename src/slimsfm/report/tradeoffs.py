@@ -21,6 +21,7 @@ from slimsfm.report.figures import COLORS, INK, PAPER, mark_logarithmic, new_fig
 _MARKERS = ("s", "o", "D", "^", "v", "P", "X", "p", "h", "<", ">")
 _VARIANTS = ("full", "dominating", "default", "random")  # get the first markers
 _FILLS = ("full", "none", "left", "top", "right", "bottom")
+_WHOLE_QUERY = "whole query, from pixels to pose"
 _MIN_MS = 1e-3  # on the axis of times
 _ADD = f"add_{ADD_FRACTIONS[0]}d"
 _RING: dict[str, Any] = {"marker": "o", "ms": 13, "mfc": "none", "mec": INK, "mew": 1.2, "ls": "none"}
@@ -43,7 +44,7 @@ class TradeoffMark:
     """Size of the map."""
 
     milliseconds: float
-    """Matching and pose, per query."""
+    """Time of a query."""
 
     accuracy: float
     """In percent, or percentage points; higher is better."""
@@ -76,7 +77,7 @@ def frontier_chart(rows: Sequence[Row]) -> Figure:
         TradeoffMark(
             kinds=(row.strategy, row.variant, row.method if several else ""),
             bytes=float(row.map_bytes),
-            milliseconds=1e3 * (row.scores.seconds.match + row.scores.seconds.pose),
+            milliseconds=1e3 * row.scores.seconds.total,
             accuracy=row.scores.add[ADD_FRACTIONS[0]],
             interval=row.intervals.get(_ADD),
         )
@@ -94,18 +95,21 @@ def curves_figure(frontier: Frontier, recommended: Mapping[str, Candidate], full
         recommended: Recommended candidates by use, which get a ring.
         full_bytes: Size of the full map, drawn as a line.
     """
+    seconds = [one.prediction.seconds for one in frontier.candidates]
+    known = all(np.isfinite(one.total) for one in seconds)
     marks = [
         TradeoffMark(
             kinds=(one.choice.method, one.choice.use, ""),
             bytes=float(one.bytes),
-            milliseconds=1e3 * one.seconds,
+            milliseconds=1e3 * (stages.total if known else stages.match + stages.pose),
             accuracy=-one.loss,
             is_recommended=any(one is best for best in recommended.values()),
         )
-        for one in frontier.candidates
+        for one, stages in zip(frontier.candidates, seconds, strict=True)
     ]
     label = "predicted change against the full map (points)"
-    return _chart(marks, label, ("method", "use", ""), highest=np.inf, full_bytes=full_bytes)
+    time = _WHOLE_QUERY if known else "matching and pose"
+    return _chart(marks, label, ("method", "use", ""), highest=np.inf, full_bytes=full_bytes, time=time)
 
 
 def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
@@ -132,6 +136,7 @@ def _chart(
     *,
     highest: float,
     full_bytes: int | None = None,
+    time: str = _WHOLE_QUERY,
 ) -> Figure:
     with styled():
         figure = new_figure(9.6, 4.2, "Accuracy over map size and over query time")
@@ -142,7 +147,7 @@ def _chart(
         if full_bytes is not None:
             by_size.axvline(full_bytes, color=INK, alpha=0.4, lw=1, ls=(0, (5, 4)), label="full map")
         by_size.set_xlabel("size of the map (logarithmic)")
-        by_time.set_xlabel("matching and pose, ms per query (logarithmic)")
+        by_time.set_xlabel(f"{time}, ms (logarithmic)")
         by_size.set_ylabel(label)
         by_size.set_yticks([tick for tick in by_size.get_yticks() if tick <= highest])
         by_size.set_ylim(*_limits(marks))
