@@ -46,7 +46,7 @@ def strangers(exact):
 def timed_trials(map_):
     """Trials whose clock says that every stage of every test takes one second."""
     ticks = count()
-    return Trials(map_, LeftOut(map_), extract_seconds=5.0, clock=lambda: float(next(ticks)))
+    return Trials(map_, LeftOut(map_), extract_seconds=lambda _: 5.0, clock=lambda: float(next(ticks)))
 
 
 def prediction(errors, inliers=None):

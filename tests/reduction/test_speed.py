@@ -15,12 +15,11 @@ def full():
 
 
 def test_points_are_compared_with_both_ways_to_match_the_full_map(full):
-    found = measure_speed(full, direct_map(full, describe_points(full)[np.arange(60)]), 0.25)
+    found = measure_speed(full, direct_map(full, describe_points(full)[np.arange(60)]))
     assert found.strategy == "progressive"
     assert found.tests == len(full.images) // 4
     for one in (found.slim, found.exhaustive, found.default):
-        assert one.extract == 0.25
-        assert min(one.match, one.pose) > 0
+        assert min(one.extract, one.match, one.pose) > 0
 
 
 def test_images_that_are_kept_are_no_queries(full):

@@ -55,8 +55,7 @@ def frontier_of(
     print_frontier(found, recommended, size)
     for use, one in recommended.items():
         console.print(f"for {use}: {one.choice.method}, {one.choice.detail}: {promise(map, full, one)}")
-        seconds = one.prediction.seconds
-        print_speed(full, apply_choice(full, one.choice), seconds.extract, f" for {use}")
+        print_speed(full, apply_choice(full, one.choice), f" for {use}")
     if json:
         with replacing(json, overwrite=overwrite) as partial:
             data = frontier_to_json(found, recommended, full, size)

@@ -185,6 +185,5 @@ def reduce(
     print_change(map, full, output, reduced.map)
     for one in reduced.forecast.values():
         console.print(f"{one.choice.method} ({one.choice.detail}): {promise(map, full, one)}")
-    seconds = [one.prediction.seconds for one in reduced.forecast.values()]
-    print_speed(full, reduced.map, seconds[0].extract)
+    print_speed(full, reduced.map)
     finish(f"{output}: written", watch, "localize", output, "IMAGES", "-o", "poses.json")

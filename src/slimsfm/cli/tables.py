@@ -127,20 +127,20 @@ def _share(part: float, whole: float) -> str:
     return f"{min(100 * part / whole, 100) if whole else 0:.3g} %"
 
 
-def print_speed(full: Map, slim: Map, extract_seconds: float, use: str = "") -> None:
+def print_speed(full: Map, slim: Map, use: str = "") -> None:
     """Measure and print how much faster queries are with a reduced map than with the full one."""
-    speed = measure_speed(full, slim, extract_seconds) if full.has_keypoints else None
+    speed = measure_speed(full, slim) if full.has_keypoints else None
     if speed is None:
         return
     ways = [(speed.exhaustive, "exhaustive")]
     if speed.strategy != "exhaustive":
         ways.append((speed.default, f"{speed.strategy}, the default of localize,"))
-    whole = np.isfinite(extract_seconds)
+    whole = np.isfinite(speed.slim.extract)
     compared = ", ".join(_faster(speed.slim, seconds, way, whole=whole) for seconds, way in ways)
     ours = speed.slim.total if whole else _matching(speed.slim)
     what = f"a whole query{use}, from pixels to pose" if whole else f"matching and pose{use}"
     stages = (
-        f" (extract {_ms(extract_seconds)}, match and pose {_ms(_matching(speed.slim))})" if whole else ""
+        f" (extract {_ms(speed.slim.extract)}, match and pose {_ms(_matching(speed.slim))})" if whole else ""
     )
     console.print(
         f"{what}: {_ms(ours)} ms{stages}, {compared}; medians of {plural(speed.tests, 'image')} left out"

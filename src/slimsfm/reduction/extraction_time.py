@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from slimsfm.arrays import Image
+from slimsfm.errors import SlimsfmError
 from slimsfm.features import Extractor
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
@@ -41,6 +42,14 @@ def extraction_seconds(map: Map, longer_side: int | None = None) -> float:
     if map not in _MEASURED:
         _MEASURED[map] = _Measured(map)
     return _MEASURED[map].seconds(longer_side)
+
+
+def extraction_if_known(map: Map, longer_side: int | None = None) -> float:
+    """The same; NaN if the map has no extractor of keypoints, or this is not available here."""
+    try:
+        return extraction_seconds(map, longer_side) if map.has_keypoints else np.nan
+    except SlimsfmError:
+        return np.nan
 
 
 class _Measured:

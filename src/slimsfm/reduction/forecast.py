@@ -72,6 +72,12 @@ class Prediction:
         right = self.rough_errors < fraction
         return tuple(100 * float(np.mean(column)) if len(column) else 0.0 for column in right.T)
 
+    def in_rounds(self, sizes: SizeTrials | None) -> "Prediction":
+        """The prediction with the time of extraction in rounds; the same if sizes cannot be tried."""
+        if sizes is None:
+            return self
+        return replace(self, seconds=replace(self.seconds, extract=sizes.extraction_seconds()))
+
     def of(self, tests: Collection[str]) -> "Prediction":
         """The prediction restricted to some tests; the time remains that of all."""
         rows = [row for row, name in enumerate(self.tests) if name in tests]
@@ -110,7 +116,8 @@ class Trials:
         map: The full map.
         left_out: The map without each of its images.
         conditions: Which queries to predict.
-        extract_seconds: Time of extracting the features of a query; NaN if it is not known.
+        extract_seconds: Time of extracting features from a query that is shrunk to a longer side, or from
+            the whole one (None); NaN if it is not known.
         clock: Measures matching and pose, in seconds.
     """
 
@@ -120,7 +127,7 @@ class Trials:
         left_out: LeftOut,
         *,
         conditions: Conditions = "rough",
-        extract_seconds: float = np.nan,
+        extract_seconds: Callable[[int | None], float] = lambda _: np.nan,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         self._map = map
@@ -177,7 +184,7 @@ class Trials:
             errors=np.array([one.error for one in found], np.float64),
             inliers=np.array([one.inliers for one in found], np.int64),
             seconds=Seconds(
-                extract=self._extract_seconds,
+                extract=self._extract_seconds(None),
                 match=float(np.median([one.match_seconds for one in found] or [0.0])),
                 pose=float(np.median([one.pose_seconds for one in found] or [0.0])),
             ),
@@ -221,6 +228,7 @@ class Trials:
             self.tests,
             lambda name, size: self._pose_at(name, targets(name), size),
             lambda pose: pose.predicted_corner_error(self._map.box),
+            self._extract_seconds,
         )
 
     def _pose_at(self, name: str, targets: list[Target], size: int) -> PoseEstimate | None:

@@ -48,6 +48,7 @@ class SizeTrials:
         tests: Sequence[str],
         localize: Callable[[str, int], PoseEstimate | None],
         predicted_error: Callable[[PoseEstimate], float],
+        extract_seconds: Callable[[int], float],
     ) -> None:
         """Set what is tried.
 
@@ -56,15 +57,23 @@ class SizeTrials:
             tests: The references; 30 of them are used if there are more.
             localize: Localizes one of them by the keypoints that an image with this longer side has.
             predicted_error: Relative corner error of a pose, if its inliers are right.
+            extract_seconds: Time of extracting features from an image with this longer side.
         """
         places = np.linspace(0, len(tests) - 1, min(_MOST_TESTS, len(tests))).round().astype(int)
         self._whole, self._tests = whole, [tests[place] for place in places.tolist()]
         self._localize, self._predicted_error = localize, predicted_error
+        self._extract_seconds = extract_seconds
         self._errors: dict[int, np.ndarray] = {}
 
     def default(self) -> ImageSizes:
         """The sizes for a map that says nothing."""
         return self._from(usual_first_size(self._whole))
+
+    def extraction_seconds(self) -> float:
+        """Predicted mean time of extraction per query, with the default sizes."""
+        usual = self.default()
+        times = [self._extract_seconds(size) for size in usual.sizes]
+        return sum(share * time for share, time in zip(usual.reached, times, strict=True))
 
     def best(self) -> ImageSizes:
         """The sizes that cost least.

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from slimsfm.errors import InputError, MapError, SlimsfmError
+from slimsfm.errors import InputError, MapError
 from slimsfm.graph import GraphOptions, ReferenceGraph, compute_graph
 from slimsfm.graph.edge_sources import Edges
 from slimsfm.localization.point_descriptors import describe_points
@@ -22,7 +23,7 @@ from slimsfm.reduction.choice import (
     points_seen,
 )
 from slimsfm.reduction.disturbance import Conditions, check_conditions
-from slimsfm.reduction.extraction_time import extraction_seconds
+from slimsfm.reduction.extraction_time import extraction_if_known, extraction_seconds
 from slimsfm.reduction.forecast import Prediction, Trials
 from slimsfm.reduction.image_sets import DominatingSetOptions, dominating_set
 from slimsfm.reduction.limits import ReductionLimits, check_reachable
@@ -122,7 +123,9 @@ def frontier(
     ]
     for use in options.uses:
         check_reachable(choices, sizes, use, limits)
-    extract_seconds = _extract_seconds(map, limits)
+    if limits.max_ms is not None:
+        extraction_seconds(map)  # an extractor that is missing is an error now
+    extract_seconds = partial(extraction_if_known, map)
     trials = Trials(map, left_out, conditions=options.conditions, extract_seconds=extract_seconds)
     full, candidates = _predicted(trials, choices, sizes, progress)
     return Frontier(full=full, candidates=candidates, bytes=weigh_map(map), diagonal=map.box.diagonal)
@@ -138,28 +141,17 @@ def _predicted(
             prediction, targets = trials.images(choice.images), trials.image_targets(choice.images)
         else:
             prediction, targets = trials.points(choice.points), trials.point_targets(choice.points)
+        tried = trials.sizes(targets)
         candidates.append(
             Candidate(
                 choice=choice,
                 bytes=size,
-                prediction=prediction,
+                prediction=prediction.in_rounds(tried),
                 full=full.of(prediction.tests),
-                sizes=trials.sizes(targets),
+                sizes=tried,
             )
         )
     return full, tuple(candidates)
-
-
-def _extract_seconds(map: Map, limits: ReductionLimits) -> float:
-    """Time of extraction; NaN where the extractor is not available and no limit depends on it."""
-    if not map.has_keypoints:
-        return np.nan
-    try:
-        return extraction_seconds(map)
-    except SlimsfmError:
-        if limits.max_ms is not None:
-            raise
-        return np.nan
 
 
 def check_reducible(map: Map) -> None:
@@ -208,7 +200,7 @@ def forecast_images(
     images = tuple(sorted(set(names)))
     slim = keep_images(map, images)
     trials = Trials(
-        map, LeftOut(map), conditions=conditions, extract_seconds=_extract_seconds(map, ReductionLimits())
+        map, LeftOut(map), conditions=conditions, extract_seconds=partial(extraction_if_known, map)
     )
     choice = Choice(
         use="images",
@@ -217,14 +209,13 @@ def forecast_images(
         images=images,
         points=points_seen(map, images),
     )
-    prediction = trials.images(images)
-    full = trials.full(prediction.tests, progress)
+    prediction, tried = trials.images(images), trials.sizes(trials.image_targets(images))
     return Candidate(
         choice=choice,
         bytes=weigh_map(slim),
-        prediction=prediction,
-        full=full,
-        sizes=trials.sizes(trials.image_targets(images)),
+        prediction=prediction.in_rounds(tried),
+        full=trials.full(prediction.tests, progress),
+        sizes=tried,
     )
 
 

@@ -1,13 +1,17 @@
 """How much faster queries are with a reduced map, against both ways to match them with the full one."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slimsfm.localization import LocalizationOptions, Localizer, Seconds
+from slimsfm.localization.cameras import QueryCamera
+from slimsfm.localization.rounds import StoredRounds
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images
+from slimsfm.reduction.extraction_time import extraction_if_known
 
 _MOST_TESTS = 9
 _SHARE_TESTED = 0.25  # of the images, at most
@@ -15,7 +19,7 @@ _SHARE_TESTED = 0.25  # of the images, at most
 
 @dataclass(frozen=True, kw_only=True)
 class Speed:
-    """Median time of each stage of a query. That of extraction is the same; NaN if it is not known."""
+    """Median time of each stage of a query; that of extraction is NaN if it is not known."""
 
     slim: Seconds
     """With the reduced map."""
@@ -33,16 +37,16 @@ class Speed:
     """Number of queries."""
 
 
-def measure_speed(map: Map, slim: Map, extract_seconds: float = np.nan) -> Speed | None:
+def measure_speed(map: Map, slim: Map) -> Speed | None:
     """Localize some images of a map with a reduced one and, without these images, with the full one.
 
     The three ways take turns at each query, so that whatever else the machine does slows all of them. The
-    images are localized by their features in the map.
+    images are localized by their features in the map: those that a shrunken image has, and more if they do
+    not suffice, as `localize` does it. The time of extraction is what such an image would take here.
 
     Args:
         map: The full map, with features.
         slim: A map that it was reduced to.
-        extract_seconds: Time of extracting the features of an image; NaN if it is not known.
 
     Returns:
         The times; None if no image can be left out of both maps.
@@ -56,14 +60,14 @@ def measure_speed(map: Map, slim: Map, extract_seconds: float = np.nan) -> Speed
     default = LocalizationOptions()
     ways = (
         Localizer(slim, default),
-        Localizer(full, LocalizationOptions(strategy="exhaustive")),
+        Localizer(full, LocalizationOptions(strategy="exhaustive", extraction="whole")),
         Localizer(full, default),
     )
     with threadpool_limits(1):
         _seconds(ways, map, tests[0])  # the first query also pays for what is only done once
         medians = np.median([_seconds(ways, map, name) for name in tests], axis=0).tolist()
     slim_seconds, exhaustive, usual = (
-        Seconds(extract=extract_seconds, match=match, pose=pose) for match, pose in medians
+        Seconds(extract=extract, match=match, pose=pose) for extract, match, pose in medians
     )
     return Speed(
         slim=slim_seconds,
@@ -74,7 +78,11 @@ def measure_speed(map: Map, slim: Map, extract_seconds: float = np.nan) -> Speed
     )
 
 
-def _seconds(ways: tuple[Localizer, ...], map: Map, name: str) -> list[tuple[float, float]]:
-    """Times of matching and pose of an image with each localizer."""
-    found = [one.localize_features(map.features[name], map.camera(name)).seconds for one in ways]
-    return [(one.match, one.pose) for one in found]
+def _seconds(ways: tuple[Localizer, ...], map: Map, name: str) -> list[tuple[float, float, float]]:
+    """Time of each stage of an image with each localizer."""
+    camera, times = QueryCamera(camera=map.camera(name), source="given"), []
+    for one in ways:
+        source = StoredRounds(map.features[name], partial(extraction_if_known, map))
+        found = one.localize_in_rounds(source, camera).seconds
+        times.append((found.extract, found.match, found.pose))
+    return times
