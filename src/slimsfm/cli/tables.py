@@ -151,10 +151,12 @@ def print_speed(full: Map, slim: Map, use: str = "") -> None:
 def _faster(slim: Seconds, full: Seconds, way: str, *, whole: bool) -> str:
     """How much faster a query is, as a whole if extraction is known, and in matching and pose alone."""
     alone = format_ratio(_matching(full) / _matching(slim), "faster", "slower")
-    if not whole:
-        return f"{alone} than {way} on the full map ({_ms(_matching(full))} ms)"
-    ratio = format_ratio(full.total / slim.total, "faster", "slower")
-    return f"{ratio} than {way} on the full map ({_ms(full.total)} ms; match and pose alone {alone})"
+    seconds, ratio, note = _matching(full), alone, ""
+    if whole:
+        seconds, note = full.total, f"; match and pose alone {alone}"
+        ratio = format_ratio(full.total / slim.total, "faster", "slower")
+    than = "as" if ratio.startswith("equally") else "than"
+    return f"{ratio} {than} {way} on the full map ({_ms(seconds)} ms{note})"
 
 
 def _matching(seconds: Seconds) -> float:
