@@ -106,7 +106,7 @@ def test_sure_poses_become_more_exact(boulder, monkeypatch):
                 corner_error(one.pose.cam_from_world, truth, boulder.map.box) for one in (before, exact)
             ]
             changes.append(np.log(errors[1] / errors[0]))
-            assert exact.num_inliers >= before.num_inliers
+            assert exact.pose.num_inliers >= before.pose.num_inliers
             assert len(exact.points2D) == len(exact.points3D_in_world) == len(exact.pose.inliers)
             assert exact.references == before.references
     assert len(changes) > 4
