@@ -73,7 +73,7 @@ def test_without_a_pose_images_grow_up_to_the_whole(view, extractor):
 
 
 def test_a_pose_that_is_believed_restricts_the_second_round_and_a_sure_one_the_last(view, extractor):
-    window = Window(100, 50, 260, 150)
+    window = Window(80, 50, 230, 160)
     first, (second, where), last = asked(ImageRounds(view), extractor, Seen(window))
     assert where == window
     assert first < second
@@ -93,13 +93,13 @@ def test_the_whole_image_gives_what_the_extractor_gives(view, extractor):
 
 
 def test_a_part_has_the_features_of_the_whole_image_in_its_pixels(view, extractor):
-    window = Window(150, 100, 450, 340)
+    window = Window(60, 40, 260, 200)
     whole = extractor.whole.extract(view).keypoints
     found = extractor.extract_part(view, None, max(view.shape), window)
     assert found.shrink_factor == 1
     assert found.features.image_size == view.shape[1::-1]
     inner = found.features.keypoints[
-        np.all((found.features.keypoints > (190, 140)) & (found.features.keypoints < (410, 300)), axis=1)
+        np.all((found.features.keypoints > (90, 70)) & (found.features.keypoints < (230, 170)), axis=1)
     ]
     nearest = np.linalg.norm(inner[:, None] - whole[None], axis=2).min(axis=1)
     assert len(inner) > 20
@@ -118,8 +118,8 @@ def test_a_shrunken_part_has_the_keypoints_of_the_shrunken_image(view, extractor
 def test_masked_pixels_hold_no_features_in_any_round(view, extractor):
     mask = np.full(view.shape[:2], 255, np.uint8)
     mask[:, : view.shape[1] // 2] = 0
-    source, window = ImageRounds(view, mask), Window(100, 50, 600, 400)
-    for found in (source.at(extractor, 300), source.part(extractor, 400, window)):
+    source, window = ImageRounds(view, mask), Window(50, 25, 310, 230)
+    for found in (source.at(extractor, 200), source.part(extractor, 280, window)):
         assert len(found.features)
         assert found.features.keypoints[:, 0].min() > view.shape[1] / 2 - 3
 
@@ -131,7 +131,7 @@ def test_an_image_as_small_as_the_first_round_is_extracted_at_once(view, extract
 
 
 def test_the_map_says_which_image_comes_first(view, boulder):
-    for first in (160, 240, 360):
+    for first in (128, 150, 180):
         map_ = replace(boulder.map, info=replace(boulder.map.info, first_image_size=first))
         recording = Recording(ImageRounds(view))
         next(levels_of(recording, SizedExtractor(map_), "rounds"))
@@ -141,14 +141,14 @@ def test_the_map_says_which_image_comes_first(view, boulder):
 def test_stored_features_are_those_that_a_shrunken_image_would_have(boulder, extractor):
     features = boulder.map.features[next(iter(boulder.map.images))]
     source = StoredRounds(features, lambda size: size / 1000)
-    whole, small = source.at(extractor, max(features.image_size)), source.at(extractor, 250)
+    whole, small = source.at(extractor, max(features.image_size)), source.at(extractor, 160)
     assert len(whole.features) == len(features) > len(small.features) > 0
     assert small.features.frames[:, 0].min() >= small.shrink_factor
     width, height = features.image_size
     before = source.seconds
-    part = source.part(extractor, 250, Window(0, 0, width // 2, height))
+    part = source.part(extractor, 160, Window(0, 0, width // 2, height))
     assert part.features.keypoints[:, 0].max() < width / 2
-    assert source.seconds - before == pytest.approx(0.125, rel=0.01)
+    assert source.seconds - before == pytest.approx(0.08, rel=0.01)
 
 
 def test_queries_are_found_in_rounds_as_in_the_whole_image(boulder):
@@ -176,7 +176,7 @@ def test_the_whole_image_is_localized_as_by_its_features(boulder, view):
 def test_several_maps_share_extractions_and_each_finds_what_it_finds_alone(boulder, view):
     maps = {
         "early": boulder.map,
-        "late": replace(boulder.map, info=replace(boulder.map.info, first_image_size=360)),
+        "late": replace(boulder.map, info=replace(boulder.map.info, first_image_size=160)),
     }
     together = MultiLocalizer({name: Localizer(map_) for name, map_ in maps.items()}).localize(view)
     for name, map_ in maps.items():

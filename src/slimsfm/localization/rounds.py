@@ -8,7 +8,7 @@ last have at most a third of its pixels.
 
 from collections.abc import Callable, Generator
 from time import perf_counter
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -59,6 +59,7 @@ def given_features(features: Features, factor: float) -> Levels:
     yield Level(Extracted(features, factor), is_last=True)
 
 
+@runtime_checkable
 class FeatureSource(Protocol):
     """Where features of one image come from."""
 
