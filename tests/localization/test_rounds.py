@@ -182,8 +182,3 @@ def test_several_maps_share_extractions_and_each_finds_what_it_finds_alone(bould
     for name, map_ in maps.items():
         alone = Localizer(map_).localize(view)
         assert np.array_equal(together[name].pose.cam_from_world.matrix(), alone.pose.cam_from_world.matrix())
-
-
-def test_unknown_extractions_are_refused():
-    with pytest.raises(ValueError, match="extraction must be one of rounds, whole"):
-        LocalizationOptions(extraction="half")

@@ -16,7 +16,7 @@ from slimsfm.photos import shrink
 FIRST_SIZES = 128, 160, 200, 240, 280, 320, 360, 400, 480, 560, 640, 800
 """Longer sides of the first image, in pixels, that `reduce` tries."""
 
-SMALLEST_SCALE_PX = 1.0
+SMALLEST_SCALE_PX = 0.9
 """Scale of the smallest keypoints that SIFT finds."""
 
 _FIRST = 0.39  # of the longer side: a seventh of the pixels
