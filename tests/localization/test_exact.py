@@ -11,6 +11,7 @@ from slimsfm.features import Features, NearestOptions
 from slimsfm.geometry import corner_error
 from slimsfm.localization import LocalizationOptions, Localizer, search
 from slimsfm.localization.exact import ExactPass, match_around, spreads
+from slimsfm.localization.point_descriptors import PointSizes
 from slimsfm.localization.strategy import Query
 from slimsfm.photos import read_image
 from slimsfm.pose import Gravity
@@ -121,7 +122,7 @@ def test_poses_with_estimated_intrinsics_stay_as_they_are(boulder):
     assert found.pose.camera is not None
     query = localizer._query(localizer.extractor.extract(read_image(path)), wrong)
     assert (
-        ExactPass(boulder.map, localizer._strategy).refined(
+        ExactPass(boulder.map, localizer._strategy, PointSizes(boulder.map)).refined(
             query, found.matches, found.pose, found.camera, RADIUS_PX
         )
         is None

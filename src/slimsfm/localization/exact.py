@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from slimsfm.arrays import Ids, Points2D
 from slimsfm.features import NearestOptions
 from slimsfm.geometry import project
+from slimsfm.localization.point_descriptors import PointSizes
 from slimsfm.localization.strategies import ThroughReferences
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy, Target, unite
 from slimsfm.localization.verification import inflation
@@ -49,10 +50,10 @@ class Exact:
 class ExactPass:
     """Makes sure poses in one map exact."""
 
-    def __init__(self, map: Map, strategy: Strategy) -> None:
+    def __init__(self, map: Map, strategy: Strategy, sizes: PointSizes) -> None:
         self._points3D_in_world = map.points3D_in_world
         self._metric = map.descriptor_metric
-        self._strategy = strategy
+        self._strategy, self._sizes = strategy, sizes
 
     def refined(
         self,
@@ -77,7 +78,7 @@ class ExactPass:
         """
         if matches.points2D is not None or pose.camera is not None or isinstance(self._strategy, PoseGuided):
             return None
-        target = self._visible(pose.cam_from_world, matches.points[pose.inliers])
+        target = self._visible(pose.cam_from_world, matches.points[pose.inliers], camera)
         pixels = project(self._points3D_in_world[target[1]], pose.cam_from_world, camera)
         near = match_around(query, target, pixels, limit_px, self._metric)
         both = replace(unite([matches, near]), references=matches.references)
@@ -99,14 +100,15 @@ class ExactPass:
         )
         return Exact(pose=kept, matches=both)
 
-    def _visible(self, cam_from_world: pycolmap.Rigid3d, agreeing: Ids) -> Target:
+    def _visible(self, cam_from_world: pycolmap.Rigid3d, agreeing: Ids, camera: pycolmap.Camera) -> Target:
         """The points that should be visible, as several images see them where the strategy knows images."""
         if isinstance(self._strategy, ThroughReferences):
             descriptors, points = self._strategy.references.nearest_points(agreeing, _REFERENCES)
         else:
             descriptors, points = self._strategy.visible_points(cam_from_world, agreeing)
-        chosen = np.linspace(0, len(points) - 1, min(_MOST_POINTS, len(points))).astype(np.int64)
-        return descriptors[chosen], points[chosen]
+        shown = np.flatnonzero(self._sizes.show(points, cam_from_world, camera))
+        shown = shown[np.linspace(0, len(shown) - 1, min(_MOST_POINTS, len(shown))).astype(np.int64)]
+        return descriptors[shown], points[shown]
 
 
 def spreads(query: Query, keypoints: Ids) -> Float64[np.ndarray, " n"]:

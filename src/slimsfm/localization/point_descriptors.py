@@ -3,14 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float32
 
-from slimsfm.arrays import Descriptors, Mask
+from slimsfm.arrays import Descriptors, Ids, Mask
 from slimsfm.features import unit_rows
 from slimsfm.features.nearest import learn_words, nearest_word
 from slimsfm.mapping.map import Map, PointDescriptors
 
 _ALIKE = 0.5  # of the largest angle between matching descriptors: points look alike
+_LEAST_SCALE_PX = 1.2  # of a keypoint that detectors find reliably
 _FAR = 0.1  # of the diagonal: confusing a point with a nearer one hardly harms a pose
 
 
@@ -63,6 +65,27 @@ def viewing_directions(map: Map) -> Float32[np.ndarray, "points 3"]:
     directions = np.zeros((len(map.point3D_ids), 3), np.float32)
     directions[described.points] = described.directions
     return directions
+
+
+class PointSizes:
+    """Tells how large the points of a map appear in an image: too small ones are not found there."""
+
+    def __init__(self, map: Map) -> None:
+        self._points3D_in_world = map.points3D_in_world
+        self._sizes = point_sizes(map)
+
+    def show(self, points: Ids, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> Mask:
+        """Which of some points a detector finds in an image; all of them if sizes are not known.
+
+        Args:
+            points: Rows of the map's points.
+            cam_from_world: Pose of the image.
+            camera: Its intrinsics, in the pixels in which features are found.
+        """
+        if self._sizes is None:
+            return np.ones(len(points), bool)
+        depths = (cam_from_world * self._points3D_in_world[points])[:, 2]
+        return camera.mean_focal_length() * self._sizes[points] >= _LEAST_SCALE_PX * depths
 
 
 def point_sizes(map: Map) -> Float32[np.ndarray, " points"] | None:

@@ -14,7 +14,7 @@ from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
 from slimsfm.localization.exact import ExactPass
 from slimsfm.localization.extraction import Extracted, Window
 from slimsfm.localization.matching import match_near
-from slimsfm.localization.point_descriptors import distinct_points
+from slimsfm.localization.point_descriptors import PointSizes, distinct_points
 from slimsfm.localization.rounds import Levels, Seen
 from slimsfm.localization.sight import Sight
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
@@ -123,9 +123,10 @@ class Search:
         self._strategy = strategy
         self._ransac = ransac
         self._focal: FocalLength = focal
-        self._verifier = Verifier(map, strategy, distinct_points(map))
+        sizes = PointSizes(map)
+        self._verifier = Verifier(map, strategy, distinct_points(map), sizes)
         self._sight = Sight(map)
-        self._exact, self._is_exact = ExactPass(map, strategy), is_exact
+        self._exact, self._is_exact = ExactPass(map, strategy, sizes), is_exact
 
     def run(
         self,

@@ -36,7 +36,7 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
-from slimsfm.localization.point_descriptors import point_sizes, viewing_directions
+from slimsfm.localization.point_descriptors import PointSizes, viewing_directions
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
@@ -63,7 +63,6 @@ _NEAREST = 3  # images that are next to a pose
 _CHECKED = 100  # visible points to look for
 _STRONGEST = 2048  # keypoints to look among
 _NEAR_PX, _FAR_PX = 5.0, 15.0  # distance from the projection of a point: at most there, at least elsewhere
-_LEAST_SCALE_PX = 1.2  # of a keypoint that detectors find reliably
 _MAX_RATIO = 0.9  # angle to the descriptor there over angle to the best one elsewhere
 
 
@@ -171,13 +170,14 @@ class Evidence:
 class Verifier:
     """Collects the evidence for poses in one map."""
 
-    def __init__(self, map: Map, strategy: Strategy, distinct: Mask) -> None:
+    def __init__(self, map: Map, strategy: Strategy, distinct: Mask, sizes: PointSizes) -> None:
         """Prepare for a map.
 
         Args:
             map: The map.
             strategy: The strategy whose matches are verified.
             distinct: Which points of the map look like no other, by `distinct_points`.
+            sizes: How large its points appear.
         """
         self._points3D_in_world = map.points3D_in_world
         self._box = map.box
@@ -186,7 +186,7 @@ class Verifier:
         self._distinct = distinct
         self._doubtful = _doubtful_images(map)
         self._directions = viewing_directions(map)
-        self._sizes = point_sizes(map)
+        self._sizes = sizes
         self._centers = np.array([image.projection_center() for image in map.images.values()])
 
     def evidence(
@@ -276,18 +276,11 @@ class Verifier:
         descriptors, points = self._strategy.visible_points(pose.cam_from_world, agreeing)
         pixels = project(self._points3D_in_world[points], pose.cam_from_world, camera)
         inside = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=1)
-        visible = np.flatnonzero(inside & self._large_enough(points, pose, camera))
+        visible = np.flatnonzero(inside & self._sizes.show(points, pose.cam_from_world, camera))
         if not len(visible):
             return 0.0
         visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
         return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
-
-    def _large_enough(self, points: Ids, pose: PoseEstimate, camera: pycolmap.Camera) -> Mask:
-        """Which points are so near that a detector finds them in the image."""
-        if self._sizes is None:
-            return np.ones(len(points), bool)
-        depths = (pose.cam_from_world * self._points3D_in_world[points])[:, 2]
-        return camera.mean_focal_length() * self._sizes[points] >= _LEAST_SCALE_PX * depths
 
 
 def _doubtful_images(map: Map) -> Mask:
