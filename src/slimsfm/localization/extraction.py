@@ -19,7 +19,7 @@ FIRST_SIZES = 128, 160, 200, 240, 280, 320, 360, 400, 480, 560, 640, 800
 SMALLEST_SCALE_PX = 0.9
 """Scale of the smallest keypoints that SIFT finds."""
 
-_FIRST = 0.37  # of the longer side: a seventh of the pixels
+_FIRST = 0.36  # of the longer side: a seventh of the pixels
 _LEAST = 128  # pixels: smaller images are extracted at once
 _MORE_PIXELS = 1 / 3  # of all rounds before the last, relative to the last
 _GROWTH = 1.4  # of the longer side from round to round, at least

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from slimsfm.arrays import Ids, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
 from slimsfm.localization import Seconds
-from slimsfm.localization.extraction import SMALLEST_SCALE_PX
+from slimsfm.localization.extraction import SMALLEST_SCALE_PX, Window
 from slimsfm.localization.matching import match_target, reference_target
 from slimsfm.localization.strategy import PointMatches, Target, unite
 from slimsfm.mapping.descriptors import quantize
@@ -29,7 +29,7 @@ from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.types import MIN_SIGMA_PX
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.reduction.disturbance import GOLDEN, ROUGH, Conditions, Disturbance, Keypoints, disturbed
-from slimsfm.reduction.image_size import SizeTrials
+from slimsfm.reduction.image_size import SizedTests, SizeTrials
 from slimsfm.selection.usable_points import LeftOut
 
 Targets = Callable[[str], list[Target]]
@@ -76,7 +76,7 @@ class Prediction:
         """The prediction with the time of extraction in rounds; the same if sizes cannot be tried."""
         if sizes is None:
             return self
-        return replace(self, seconds=replace(self.seconds, extract=sizes.extraction_seconds()))
+        return replace(self, seconds=replace(self.seconds, extract=sizes.default().extract_seconds))
 
     def of(self, tests: Collection[str]) -> "Prediction":
         """The prediction restricted to some tests; the time remains that of all."""
@@ -224,12 +224,22 @@ class Trials:
             return None
         sides = [max(camera.width, camera.height) for camera in map(self._map.camera, self._map.images)]
         return SizeTrials(
-            min(int(np.median(sides)), largest),
-            self.tests,
-            lambda name, size: self._pose_at(name, targets(name), size),
-            lambda pose: pose.predicted_corner_error(self._map.box),
-            self._extract_seconds,
+            SizedTests(
+                whole=min(int(np.median(sides)), largest),
+                names=self.tests,
+                localize=lambda name, size: self._pose_at(name, targets(name), size),
+                share=self._shown,
+                predicted_error=lambda pose: pose.predicted_corner_error(self._map.box),
+                extract_seconds=self._extract_seconds,
+            )
         )
+
+    def _shown(self, name: str) -> float:
+        """Share of a test's image that shows points of the map."""
+        camera, seen = self._map.camera(name), self._map.observations[name]
+        pixels = self._left_out.query(name).keypoints[seen.rows]
+        window = Window.around(pixels, camera.width, camera.height)
+        return window.area / (camera.width * camera.height) if window else 1.0
 
     def _pose_at(self, name: str, targets: list[Target], size: int) -> PoseEstimate | None:
         """Localize a test by the keypoints of an image whose longer side has `size` pixels."""

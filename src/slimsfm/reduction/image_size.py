@@ -5,8 +5,9 @@ scale is still large enough after shrinking, so a map without photos can tell ho
 an image of each size would localize, and how exactly.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -21,92 +22,101 @@ _AS_EXACT = 1.2  # times the error with the whole image, at which a smaller firs
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageSizes:
-    """The rounds of extraction for a query of the size of a map's photos."""
+class FirstSize:
+    """What queries cost if their first image has a certain size."""
 
-    sizes: tuple[int, ...]
-    """Longer side of the image in each round, in pixels."""
+    size: int
+    """Longer side of the first image, in pixels."""
 
-    reached: tuple[float, ...]
-    """Predicted share of queries that need each round; all need the first."""
+    pixels: float
+    """Pixels extracted per query on average, and what each round costs besides, in pixels."""
+
+    extract_seconds: float
+    """Predicted mean time of extraction per query."""
 
     error: float
     """Median of the predicted corner error of the poses that end the search."""
 
-    @property
-    def pixels(self) -> float:
-        """Pixels extracted per query on average, and what each round costs besides, in pixels."""
-        return sum(share * (size**2 + _ROUND) for size, share in zip(self.sizes, self.reached, strict=True))
+
+@dataclass(frozen=True, kw_only=True)
+class SizedTests:
+    """How references that are left out are localized by images of several sizes."""
+
+    whole: int
+    """Longer side of the image from which features are extracted at once."""
+
+    names: Sequence[str]
+    """The references."""
+
+    localize: Callable[[str, int], PoseEstimate | None]
+    """Localizes one of them by the keypoints that an image with this longer side has."""
+
+    share: Callable[[str], float]
+    """Share of the image of one of them that shows points of the map."""
+
+    predicted_error: Callable[[PoseEstimate], float]
+    """Relative corner error of a pose, if its inliers are right."""
+
+    extract_seconds: Callable[[int], float]
+    """Time of extracting features from an image with this longer side."""
 
 
 class SizeTrials:
-    """Tries image sizes on references that are left out."""
+    """Tries sizes of the first image on references that are left out."""
 
-    def __init__(
-        self,
-        whole: int,
-        tests: Sequence[str],
-        localize: Callable[[str, int], PoseEstimate | None],
-        predicted_error: Callable[[PoseEstimate], float],
-        extract_seconds: Callable[[int], float],
-    ) -> None:
-        """Set what is tried.
+    def __init__(self, tests: SizedTests) -> None:
+        """Set the references; 30 of them are used if there are more."""
+        places = np.linspace(0, len(tests.names) - 1, min(_MOST_TESTS, len(tests.names)))
+        self._tests, self._whole = tests, tests.whole
+        self._names = [tests.names[round(place)] for place in places]
+        self._outcome = cache(self._localized)
 
-        Args:
-            whole: Longer side of the image from which features are extracted at once.
-            tests: The references; 30 of them are used if there are more.
-            localize: Localizes one of them by the keypoints that an image with this longer side has.
-            predicted_error: Relative corner error of a pose, if its inliers are right.
-            extract_seconds: Time of extracting features from an image with this longer side.
-        """
-        places = np.linspace(0, len(tests) - 1, min(_MOST_TESTS, len(tests))).round().astype(int)
-        self._whole, self._tests = whole, [tests[place] for place in places.tolist()]
-        self._localize, self._predicted_error = localize, predicted_error
-        self._extract_seconds = extract_seconds
-        self._errors: dict[int, np.ndarray] = {}
-
-    def default(self) -> ImageSizes:
-        """The sizes for a map that says nothing."""
+    def default(self) -> FirstSize:
+        """The size for a map that says nothing."""
         return self._from(usual_first_size(self._whole))
 
-    def extraction_seconds(self) -> float:
-        """Predicted mean time of extraction per query, with the default sizes."""
-        usual = self.default()
-        times = [self._extract_seconds(size) for size in usual.sizes]
-        return sum(share * time for share, time in zip(usual.reached, times, strict=True))
-
-    def best(self) -> ImageSizes:
-        """The sizes that cost least.
+    def best(self) -> FirstSize:
+        """The size that costs least.
 
         A first image smaller than the default one must give poses that are predicted to be about as exact as
         those of the whole image, one at least as large need not.
         """
         usual, whole = self.default(), self._from(self._whole)
         tried = [self._from(size) for size in FIRST_SIZES if size < self._whole]
-        smaller = [
-            one for one in tried if one.sizes[0] < usual.sizes[0] and one.error <= _AS_EXACT * whole.error
-        ]
-        larger = [one for one in tried if one.sizes[0] > usual.sizes[0]]
+        exact = [one for one in tried if one.error <= _AS_EXACT * whole.error]
+        smaller = [one for one in exact if one.size < usual.size]
+        larger = [one for one in tried if one.size > usual.size]
         return min([usual, *smaller, *larger, whole], key=lambda one: one.pixels)
 
-    def _from(self, first: int) -> ImageSizes:
-        between = second_size(self._whole, first) if first < self._whole else None
-        sizes = tuple(sorted({first, between or first, self._whole}))
-        left, ended = np.ones(len(self._tests), bool), np.full(len(self._tests), np.inf)
-        reached = []
-        for size in sizes:
-            reached.append(float(left.mean()))
-            errors = self._errors_at(size)
-            ends = left & ((errors <= ACCURATE) | (size == sizes[-1]))
-            ended[ends] = errors[ends]
-            left &= ~ends
-        return ImageSizes(sizes=sizes, reached=tuple(reached), error=float(np.median(ended)))
+    def _from(self, first: int) -> FirstSize:
+        rounds = [list(self._rounds(name, first)) for name in self._names]
+        per_query = len(rounds)
+        pixels = sum(share * size**2 + _ROUND for one in rounds for size, share, _ in one)
+        seconds = sum(share * self._tests.extract_seconds(size) for one in rounds for size, share, _ in one)
+        errors = [one[-1][2] for one in rounds]
+        return FirstSize(
+            size=first,
+            pixels=pixels / per_query,
+            extract_seconds=seconds / per_query,
+            error=float(np.median(errors)),
+        )
 
-    def _errors_at(self, size: int) -> np.ndarray:
-        """Predicted error of each test with an image of a size; infinite if its pose cannot be sure."""
-        if size not in self._errors:
-            poses = [self._localize(name, size) for name in self._tests]
-            enough = [pose if pose and pose.num_inliers >= _SURE_INLIERS else None for pose in poses]
-            errors = [np.inf if pose is None else self._predicted_error(pose) for pose in enough]
-            self._errors[size] = np.array(errors, np.float64)
-        return self._errors[size]
+    def _rounds(self, name: str, first: int) -> Iterator[tuple[int, float, float]]:
+        """Size, share of the image and predicted error of each round until one suffices."""
+        error, is_posed = self._outcome(name, first)
+        yield first, 1.0, error
+        if error <= ACCURATE or first >= self._whole:
+            return
+        share = self._tests.share(name) if is_posed else 1.0
+        if size := second_size(self._whole, first, share):
+            error, _ = self._outcome(name, size)
+            yield size, share, error
+        if error > ACCURATE:
+            yield self._whole, 1.0, self._outcome(name, self._whole)[0]
+
+    def _localized(self, name: str, size: int) -> tuple[float, bool]:
+        """Predicted error of a pose that can be sure, infinite without one; whether there is any pose."""
+        pose = self._tests.localize(name, size)
+        if pose is None or pose.num_inliers < _SURE_INLIERS:
+            return np.inf, pose is not None
+        return self._tests.predicted_error(pose), True

@@ -346,7 +346,7 @@ def _within(
 
 def _with_first_image_size(map: Map, forecast: Mapping[str, Candidate]) -> Map:
     """The map, knowing which image to extract the first features of queries from."""
-    found = [one.sizes.best().sizes[0] for one in forecast.values() if one.sizes]
+    found = [one.sizes.best().size for one in forecast.values() if one.sizes]
     return replace(map, info=replace(map.info, first_image_size=max(found, default=None)))
 
 
