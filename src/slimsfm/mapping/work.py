@@ -14,6 +14,7 @@ from slimsfm.arrays import Image
 from slimsfm.features import Extractor, Features
 from slimsfm.geometry import Box
 from slimsfm.lenses import camera_fault
+from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.choice import PickedModel
 from slimsfm.mapping.extraction import CameraSharing
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
@@ -172,6 +173,9 @@ class BuildWork:
 
     known: KnownPoses | None
     """Known poses, if any: then points are triangulated and nothing else is estimated."""
+
+    workers: Workers
+    """Who matches pairs of images."""
 
     progress: ProgressBar
     """Progress callback."""
