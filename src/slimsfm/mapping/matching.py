@@ -120,12 +120,17 @@ def _view(matching: PairMatching, name: str, features: Features) -> View:
 def verify(a: View, b: View, matches: IndexPairs, *, seed: int) -> pycolmap.TwoViewGeometry:
     """Estimate the two-view geometry of two images, whose inliers are the verified matches.
 
-    The random numbers depend on the seed alone, not on the pairs before.
+    The random numbers depend on the seed alone, not on the pairs before. Most pairs of images show different
+    things and have a few wrong matches. RANSAC would search them for the smallest share of inliers that its
+    options allow, although a pair with fewer than 15 inliers is not taken: it is told the larger share.
     """
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    if len(matches) < options.min_num_inliers:
+    ransac, fewest = options.ransac, options.min_num_inliers
+    if len(matches) < fewest:
         return pycolmap.TwoViewGeometry()
+    ransac.random_seed = seed
+    ransac.min_inlier_ratio = max(ransac.min_inlier_ratio, fewest / len(matches))
+    ransac.dyn_num_trials_multiplier = 1.0  # as many trials as the confidence needs, not three times as many
     return pycolmap.estimate_two_view_geometry(
         a.camera, a.keypoints, b.camera, b.keypoints, matches.astype(np.uint32), options
     )
