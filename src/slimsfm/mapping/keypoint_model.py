@@ -13,7 +13,7 @@ from slimsfm.mapping.diagnosis import diagnose
 from slimsfm.mapping.extraction import Extracted, color_points
 from slimsfm.mapping.matching import PairMatching, match_and_verify
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
-from slimsfm.mapping.pairs import choose_pairs
+from slimsfm.mapping.pairs import choose_pairs, unsure_pairs
 from slimsfm.mapping.reconstruction import reconstruct
 from slimsfm.mapping.scratch import put_keypoints, verified_matches, write_database, write_geometries
 from slimsfm.mapping.sfm import triangulate
@@ -99,7 +99,8 @@ def _match(
         seed=options.seed,
     )
     pairs = choose_pairs(features, options.pairs, seed=options.seed)
-    geometries = match_and_verify(matching, pairs, work.workspace, work.workers, work.progress)
+    unsure = unsure_pairs(names, pairs, options.pairs) if options.extractor == "sift" else frozenset()
+    geometries = match_and_verify(matching, pairs, work.workspace, work.workers, work.progress, unsure=unsure)
     write_database(database, shrunk.features, shrunk.cameras)
     write_geometries(database, names, geometries)
     return database

@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 from threadpoolctl import threadpool_limits
 
-from slimsfm.arrays import IndexPairs, Points2D
-from slimsfm.features import Features, Matcher
+from slimsfm.arrays import Descriptors, IndexPairs, Points2D
+from slimsfm.features import Features, Matcher, match_nearest, unit_rows
 from slimsfm.features.store import FeatureFile
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.orientation import turned_features
@@ -22,6 +22,8 @@ from slimsfm.mapping.workspace import Arrays, Workspace
 from slimsfm.progress import ProgressBar, silent
 
 _CACHED = 256  # images whose features a process keeps in memory
+_LARGEST = 256  # features of an image that tell whether it may show the same as another one
+_ALIKE = 8  # matches among them with which it may
 _MATRICES = "E", "F", "H"
 
 
@@ -56,6 +58,7 @@ class _Block:
     matching: PairMatching
     stamp: tuple[int, int]  # a worker that outlives a build must not use the features of another one
     pairs: Pairs
+    unsure: frozenset[tuple[str, str]]
 
 
 def match_and_verify(
@@ -64,18 +67,34 @@ def match_and_verify(
     workspace: Workspace,
     workers: Workers = Workers(),
     progress: ProgressBar = silent,
+    *,
+    unsure: frozenset[tuple[str, str]] = frozenset(),
 ) -> Geometries:
     """Match pairs of images and verify the matches, without what an interrupted build did.
 
     The result for a pair depends on nothing but the pair, so blocks and workers change no bit of it. Pairs
     without a verified match are omitted.
+
+    Args:
+        matching: How to match and verify.
+        pairs: Pairs of images.
+        workspace: Keeps the result of each block of pairs, and has those of an interrupted build.
+        workers: Who does the work.
+        progress: Progress callback.
+        unsure: Pairs that are left out unless at least eight of their 256 largest features match [1].
+
+    References:
+        [1] Wu, Towards Linear-Time Incremental Structure from Motion, 3DV 2013 (preemptive matching).
     """
     found = matching.features.stat()
     stamp = found.st_size, found.st_mtime_ns
     workers = workers if matching.one_thread else Workers()
 
     def solve(blocks: Sequence[Pairs]) -> Generator[Arrays, None, None]:
-        tasks = [_Block(matching=matching, stamp=stamp, pairs=block) for block in blocks]
+        tasks = [
+            _Block(matching=matching, stamp=stamp, pairs=block, unsure=unsure.intersection(block))
+            for block in blocks
+        ]
         return workers.in_order(_solve, tasks)
 
     blocks = workspace.in_blocks(pairs, solve, progress, "match pairs")
@@ -87,12 +106,25 @@ def _solve(block: _Block) -> Arrays:
     matching = block.matching
     read = _reader(matching.features.absolute(), block.stamp)
     views = lru_cache(lambda name: _view(matching, name, read(name)))
-    geometries = []
+    largest = lru_cache(lambda name: _largest(read(name)))
+
+    def solve(a: str, b: str) -> pycolmap.TwoViewGeometry:
+        if (a, b) in block.unsure and len(match_nearest(largest(a), largest(b))) < _ALIKE:
+            return pycolmap.TwoViewGeometry()
+        matches = matching.matcher.match(read(a), read(b))
+        return verify(views(a), views(b), matches, seed=matching.seed)
+
     with threadpool_limits(1) if matching.one_thread else nullcontext():
-        for a, b in block.pairs:
-            matches = matching.matcher.match(read(a), read(b))
-            geometries.append(verify(views(a), views(b), matches, seed=matching.seed))
-    return _packed(geometries)
+        return _packed([solve(a, b) for a, b in block.pairs])
+
+
+def _largest(features: Features) -> Descriptors:
+    """Unit descriptors of the largest features, or the strongest if sizes are unknown.
+
+    Few of them show in many images: what is large in the image is seen from far and near.
+    """
+    sizes = features.scores if features.frames is None else features.frames[:, 0]
+    return unit_rows(features.descriptors[np.argsort(-sizes, kind="stable")[:_LARGEST]])
 
 
 @lru_cache(maxsize=1)

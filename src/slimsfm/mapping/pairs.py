@@ -19,7 +19,8 @@ Matches = Mapping[tuple[str, str], Int64[np.ndarray, "_ 2"]]
 
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 
-_MOST_EXHAUSTIVE = 200  # images up to which "auto" is exhaustive
+_MOST_EXHAUSTIVE = 200  # images up to which "auto" tries all pairs
+_MOST_SURE = 60  # images up to which "auto" matches all of them
 _WORD_SAMPLES = 50_000  # descriptors that the vocabulary is learned from
 
 
@@ -32,6 +33,14 @@ def choose_pairs(features: Mapping[str, Features], choice: PairChoice, *, seed: 
         return sequential_pairs(names)
     similar = similar_pairs(names, _global_descriptors(features, seed))
     return similar if choice == "similar" else sorted({*sequential_pairs(names), *similar})
+
+
+def unsure_pairs(names: Iterable[str], pairs: Pairs, choice: PairChoice) -> frozenset[tuple[str, str]]:
+    """The pairs to match only if they look alike: with "auto", of many images those that are no neighbors."""
+    names = list(names)
+    if choice != "auto" or len(names) <= _MOST_SURE:
+        return frozenset()
+    return frozenset(pairs).difference(sequential_pairs(names))
 
 
 def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[np.ndarray, "n kd"]:

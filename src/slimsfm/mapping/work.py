@@ -39,7 +39,8 @@ class BuildOptions:
 
     pairs: PairChoice = "auto"
     """Pairs of images to match: all (exhaustive), neighbors in order of name (sequential), or images that
-    look alike (similar). auto: exhaustive up to 200 images, otherwise sequential and similar; without a
+    look alike (similar). auto: exhaustive up to 200 images, otherwise sequential and similar, and above 60
+    images without pairs that are no neighbors and whose largest SIFT features do not match; without a
     detector, exhaustive up to 30 images, otherwise by pose if poses are known, else sequential."""
 
     masks: Path | None = None
