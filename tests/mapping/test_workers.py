@@ -14,7 +14,7 @@ from slimsfm.errors import ImageError
 from slimsfm.execution import dask_cluster, processes
 from slimsfm.features import Features, runs_on_one_core
 from slimsfm.features.nearest import Nearest
-from slimsfm.features.store import FeatureWriter
+from slimsfm.features.store import FeatureFile, FeatureWriter
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.build import BuildOptions, build_map
 from slimsfm.mapping.io import write_map
@@ -102,6 +102,19 @@ class InThisProcess:
         raise AssertionError("sent to another process")
 
 
+def matching_of(images, **changes):
+    given = {
+        "features": images / FEATURES,
+        "turns": {},
+        "factors": dict.fromkeys(NAMES, 1.0),
+        "cameras": dict.fromkeys(NAMES, camera()),
+        "matcher": Nearest(),
+        "one_thread": True,
+        "seed": 0,
+    }
+    return PairMatching(**{**given, **changes})
+
+
 @pytest.fixture
 def images(tmp_path):
     """Images that show the same points from the same place, each with some points of its own."""
@@ -128,15 +141,8 @@ def images(tmp_path):
 
 @pytest.mark.parametrize("one_thread", [True, False])
 def test_matches_are_verified_wherever_the_matcher_runs(images, one_thread):
-    matching = PairMatching(
-        features=images / FEATURES,
-        turns={},
-        factors=dict.fromkeys(NAMES, 1.0),
-        cameras=dict.fromkeys(NAMES, camera()),
-        matcher=Nearest() if one_thread else InThisProcess(),
-        one_thread=one_thread,
-        seed=0,
-    )
+    matcher = Nearest() if one_thread else InThisProcess()
+    matching = matching_of(images, matcher=matcher, one_thread=one_thread)
     workers = Workers(open_executor=partial(processes, 2), min_seconds=0.0)
     found = match_and_verify(matching, exhaustive_pairs(NAMES), Workspace(images, {}), workers)
     assert list(found) == exhaustive_pairs(NAMES)
@@ -147,6 +153,36 @@ def test_matches_are_verified_wherever_the_matcher_runs(images, one_thread):
     for pair, geometry in found.items():
         assert again[pair].config == geometry.config
         assert np.array_equal(again[pair].inlier_matches, geometry.inlier_matches)
+
+
+def test_unsure_pairs_are_left_out_unless_their_largest_features_match(images):
+    read = FeatureFile(images / FEATURES)
+    everything = exhaustive_pairs(NAMES)
+    with FeatureWriter(images / "others.h5") as writer:
+        for number, name in enumerate(NAMES):
+            found = read[name]  # in the last three images, what they have in common is small
+            sizes = np.where(np.arange(120) < 80, 1.0 if number < 3 else 0.1, 0.5)
+            frames = np.stack([sizes, np.zeros(120)], axis=1).astype(np.float32)
+            writer.write(name, repeated(replace(found, frames=frames), 40 if number < 3 else 400))
+    matching = matching_of(images, features=images / "others.h5")
+    sure = frozenset({("a", "f")})
+    found = match_and_verify(matching, everything, Workspace(images, {}), unsure=frozenset(everything) - sure)
+    assert list(found) == [("a", "b"), ("a", "c"), ("a", "f"), ("b", "c")]
+
+
+def repeated(features, count):
+    """Features with other ones of their own size, which match nothing."""
+    rng = np.random.default_rng(int(features.keypoints.sum()))
+    others = Features(
+        keypoints=rng.uniform(50, 400, (count, 2)).astype(np.float32),
+        descriptors=rng.uniform(0, 255, (count, 128)).astype(np.uint8),
+        scores=np.ones(count, np.float32),
+        image_size=features.image_size,
+        frames=np.full((count, 2), 0.5, np.float32),
+    )
+    parts = ("keypoints", "descriptors", "scores", "frames")
+    joined = {part: np.concatenate([getattr(features, part), getattr(others, part)]) for part in parts}
+    return replace(features, **joined)
 
 
 def test_networks_stay_in_one_process():
