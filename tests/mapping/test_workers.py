@@ -1,6 +1,7 @@
 """Workers that extract and match change no byte of a map, and neither do interruptions among them."""
 
 import logging
+import os
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -54,11 +55,14 @@ def test_processes_give_the_same_bytes(rendered, whole, tmp_path, workers):
     assert bytes_of(made, tmp_path / "map") == whole
 
 
-def test_a_dask_cluster_gives_the_same_bytes_after_interruptions(rendered, whole, tmp_path, scheduler):
+def test_a_dask_cluster_gives_the_same_bytes_after_interruptions(
+    rendered, whole, tmp_path, scheduler, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # the workers have another working folder
     build = partial(
         build_map,
-        rendered.folder,
-        workspace=tmp_path / "work",
+        os.path.relpath(rendered.folder),
+        workspace="work",
         open_executor=partial(dask_cluster, scheduler, 2),
         min_seconds=0.0,
     )

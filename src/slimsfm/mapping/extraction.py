@@ -114,10 +114,12 @@ def extract_features(
     """
     left = [name for name in names if not _recall(photos, name, workspace)]
     workers = workers if runs_on_one_core(extractor.name) else Workers()
-    with closing(workers.in_order(partial(_extract, photos, extractor), left)) as found:
+    with closing(workers.in_order(partial(_extract, photos.absolute(), extractor), left)) as found:
         for name in progress(left, resumed("extract features", len(names) - len(left))):
             with skipped.skipping(name):
-                save_arrays(workspace.extracted(name), _unless_error(next(found)))
+                if isinstance(arrays := next(found), str):
+                    raise photos.error(name, arrays)
+                save_arrays(workspace.extracted(name), arrays)
                 _recall(photos, name, workspace)
     colors, output = {}, workspace.folder / FEATURES
     with FeatureWriter(output) as writer:
@@ -128,12 +130,12 @@ def extract_features(
     return Extracted(features=FeatureFile(output), colors=colors)
 
 
-def _extract(photos: MaskedPhotos, extractor: Extractor, name: str) -> Arrays | ImageError:
-    """The features of a photo, or why it cannot be read: an error raised in a worker would be tried again."""
+def _extract(photos: MaskedPhotos, extractor: Extractor, name: str) -> Arrays | str:
+    """The features of a photo, or why it cannot be read: a task that raises an error would be tried again."""
     try:
         photo = photos.read(name)
     except ImageError as error:
-        return error
+        return photos.reason(name, error)
     found = extractor.extract(photo.image, photo.mask)
     arrays = {
         "keypoints": found.keypoints,
@@ -146,12 +148,6 @@ def _extract(photos: MaskedPhotos, extractor: Extractor, name: str) -> Arrays | 
     if found.frames is not None:
         arrays["frames"] = found.frames
     return arrays
-
-
-def _unless_error(found: Arrays | ImageError) -> Arrays:
-    if isinstance(found, ImageError):
-        raise found
-    return found
 
 
 def _recall(photos: MaskedPhotos, name: str, workspace: Workspace) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -86,6 +86,7 @@ def match_and_verify(
     References:
         [1] Wu, Towards Linear-Time Incremental Structure from Motion, 3DV 2013 (preemptive matching).
     """
+    matching = replace(matching, features=matching.features.absolute())
     found = matching.features.stat()
     stamp = found.st_size, found.st_mtime_ns
     workers = workers if matching.one_thread else Workers()
@@ -104,7 +105,7 @@ def match_and_verify(
 def _solve(block: _Block) -> Arrays:
     """Match and verify the pairs of a block."""
     matching = block.matching
-    read = _reader(matching.features.absolute(), block.stamp)
+    read = _reader(matching.features, block.stamp)
     views = lru_cache(lambda name: _view(matching, name, read(name)))
     largest = lru_cache(lambda name: _largest(read(name)))
 
