@@ -1,7 +1,11 @@
 """Equal results wherever tasks run, and whichever worker fails or dies."""
 
 import os
+import subprocess
+import sys
+import time
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,3 +98,23 @@ def test_error_names_a_scheduler_that_does_not_answer(address):
 
 def test_num_cores_respects_the_affinity_of_the_process():
     assert num_cores() == len(os.sched_getaffinity(0))
+
+
+KILLS_ITSELF = """
+import os, signal
+from slimsfm.execution import processes
+if __name__ == "__main__":
+    with processes(1) as executor:
+        print(executor.submit(os.getpid).result(), flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_processes_end_with_a_parent_that_is_killed(tmp_path):
+    (tmp_path / "script.py").write_text(KILLS_ITSELF)
+    command = [sys.executable, tmp_path / "script.py"]
+    worker = int(subprocess.run(command, check=False, stdout=subprocess.PIPE).stdout)
+    deadline = time.monotonic() + 60
+    while Path(f"/proc/{worker}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)

@@ -4,6 +4,7 @@ Tasks are function calls, and every way to run them is a `concurrent.futures.Exe
 """
 
 import logging
+import os
 import signal
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -17,8 +18,8 @@ from concurrent.futures import (
 )
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
-from multiprocessing import get_context
-from os import sched_getaffinity
+from multiprocessing import get_context, parent_process
+from threading import Thread
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -39,21 +40,30 @@ _LOGGER = logging.getLogger(__name__)
 
 def num_cores() -> int:
     """Number of cores that this process may use."""
-    return len(sched_getaffinity(0))
+    return len(os.sched_getaffinity(0))
 
 
 @contextmanager
 def processes(count: int) -> Iterator[Executor]:
     """Open a pool of new processes of this machine. Only this process handles Ctrl-C."""
-    ignore = (signal.SIGINT, signal.SIG_IGN)
-    with ProcessPoolExecutor(
-        count, get_context("spawn"), initializer=signal.signal, initargs=ignore
-    ) as executor:
+    with ProcessPoolExecutor(count, get_context("spawn"), initializer=_start_worker) as executor:
         try:
             yield executor
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the parent process, and end with it even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager

@@ -108,7 +108,7 @@ def few(tmp_path_factory):
     [
         (signal.SIGKILL, "extracted/*.npz"),
         (signal.SIGTERM, "extracted/*.npz"),
-        (signal.SIGKILL, "database.images"),
+        (signal.SIGKILL, "matched/*.npz"),
     ],
 )
 def test_the_same_command_goes_on_with_a_build_that_was_stopped(few, start, tmp_path, how, stage):

@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slimsfm.features import Features, unit_rows
-from slimsfm.mapping.pairs import choose_pairs, exhaustive_pairs, sequential_pairs, similar_pairs
+from slimsfm.mapping.pairs import (
+    choose_pairs,
+    exhaustive_pairs,
+    sequential_pairs,
+    similar_pairs,
+    unsure_pairs,
+)
 
 NAMES = st.lists(st.text("ab01²/ .", min_size=1, max_size=6), min_size=2, max_size=15, unique=True)
 
@@ -107,3 +113,11 @@ def test_auto_is_exhaustive_up_to_200_images_and_sparser_above():
     assert_pairs(many, features)
     assert len(many) < 0.5 * len(exhaustive_pairs(features))
     assert set(many) == {*sequential_pairs(features), *choose_pairs(features, "similar", seed=0)}
+
+
+def test_of_many_images_only_neighbors_are_sure_to_be_matched():
+    names = [f"frame{i}.png" for i in range(61)]
+    pairs = exhaustive_pairs(names)
+    assert unsure_pairs(names, pairs, "auto") == set(pairs) - set(sequential_pairs(names))
+    assert not unsure_pairs(names, pairs, "exhaustive")
+    assert not unsure_pairs(names[1:], exhaustive_pairs(names[1:]), "auto")

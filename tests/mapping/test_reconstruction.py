@@ -14,9 +14,9 @@ from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.mapping import sfm
 from slimsfm.mapping.choice import CheckedModel, pick_model
-from slimsfm.mapping.pairs import verify_pairs
+from slimsfm.mapping.matching import verify_matches
 from slimsfm.mapping.reconstruction import reconstruct
-from slimsfm.mapping.scratch import write_database
+from slimsfm.mapping.scratch import write_database, write_geometries
 from slimsfm.mapping.sfm import colmap_warnings
 from slimsfm.synthetic.scene import look_at
 
@@ -63,12 +63,11 @@ def mapped(folder: Path, *sets: Photos) -> list[CheckedModel]:
     seen = {name: one.seen(number) for one in sets for number, name in enumerate(one.names)}
     features = {name: _features(pixels) for name, (pixels, _) in seen.items()}
     names, database = sorted(features), folder / "database.db"
-    write_database(database, features, dict.fromkeys(names, _camera(1.2 * SIZE[0])))
+    cameras = dict.fromkeys(names, _camera(1.2 * SIZE[0]))
+    write_database(database, features, cameras)
     matches = {(a, b): _matched(seen[a][1], seen[b][1]) for a, b in combinations(names, 2)}
     with colmap_warnings():
-        verify_pairs(
-            database, names, {pair: rows for pair, rows in matches.items() if len(rows) > 15}, seed=0
-        )
+        write_geometries(database, names, verify_matches(features, cameras, matches, seed=0))
         return reconstruct(database, names, folder / "sfm", seed=0)
 
 

@@ -72,22 +72,23 @@ def test_other_photos_masks_and_options_start_afresh(rendered, tmp_path, change)
 
 def test_pairs_are_matched_once(tmp_path):
     pairs = [(f"{i}", f"{j}") for i in range(10) for j in range(i)]
-    matched = []
+    solved = []
 
-    def match(a, b):
-        matched.append((a, b))
-        return np.full((int(a), 2), int(b))
+    def solve(blocks):
+        for block in blocks:
+            solved.append(block)
+            yield {"lengths": np.array([int(a) for a, _ in block])}
 
     def workspace():
         (tmp_path / "work").mkdir(exist_ok=True)
         return Workspace(tmp_path / "work", {"of": "these"})
 
     with pytest.raises(KeyboardInterrupt):
-        workspace().match(pairs, match, StopsAt("match pairs", 43), "match pairs")
-    assert len(matched) == 43
+        workspace().in_blocks(pairs, solve, StopsAt("match pairs", 33), "match pairs")
+    assert len(solved) == 4
     progress = StopsAt("", 0)
-    found = workspace().match(pairs, match, progress, "match pairs")
+    found = workspace().in_blocks(pairs, solve, progress, "match pairs")
     assert progress.seen == {"match pairs (40 done before)": 5}
-    assert matched == [*pairs[:43], *pairs[40:]]
-    assert list(found) == pairs
-    assert all(np.array_equal(found[a, b], match(a, b)) for a, b in pairs)
+    assert [pair for block in solved for pair in block] == pairs
+    assert [pair for block, _ in found for pair in block] == pairs
+    assert all(arrays["lengths"].tolist() == [int(a) for a, _ in block] for block, arrays in found)

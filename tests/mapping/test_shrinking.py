@@ -80,7 +80,7 @@ def test_photos_of_several_sizes_are_shrunk_by_a_factor_each_and_known_cameras_s
     for name, lens in cameras.items():
         assert np.array_equal(made.camera(name).params, lens.params)
         assert (made.camera(name).width, made.camera(name).height) == (lens.width, lens.height)
-    assert len(made.point3D_ids) == pytest.approx(len(posed.map.point3D_ids), rel=0.05)
+    assert len(made.point3D_ids) == pytest.approx(len(posed.map.point3D_ids), rel=0.1)
 
 
 @pytest.mark.parametrize("focal", ["known", "unknown"])

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from slimsfm.cli.arguments import Networks, Reading
+from slimsfm.cli.arguments import Execution, Networks, Reading
 from slimsfm.cli.options import Advanced, ImagesPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish_map, plural
 from slimsfm.files.resumable import resumable_folder
@@ -19,6 +19,7 @@ def build_photos(
     build: Annotated[BuildOptions, Advanced(("masks", "alpha", "max_image_size", "max_features", "seed"))] = (
         BuildOptions()
     ),
+    execution: Annotated[Execution, Advanced()] = Execution(),
     networks: Annotated[Networks, Advanced()] = Networks(),
     reading: Annotated[Reading, Advanced()] = Reading(),
     overwrite: bool = False,
@@ -29,6 +30,7 @@ def build_photos(
         images: Folder of photos; subfolders are included.
         output: Folder of the map.
         build: How to build the map.
+        execution: Where features are extracted and matched.
         networks: Where learned methods run.
         reading: Limits on what is read.
         overwrite: Replace an existing map.
@@ -39,7 +41,9 @@ def build_photos(
     needed = bytes_to_build(images, build)
     check_output(output, images, build.masks, build.box, overwrite=overwrite, least_bytes=needed)
     with resumable_folder(output) as workspace:
-        made = build_map(images, build, workspace=workspace, progress=shown)
+        made = build_map(
+            images, build, workspace=workspace, open_executor=execution.open_executor(), progress=shown
+        )
         write_map(made, output, overwrite=overwrite)
     if made.unregistered:
         names = ", ".join(made.unregistered)

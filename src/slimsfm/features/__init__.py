@@ -11,7 +11,7 @@ from slimsfm.features.base import (
     unmasked,
 )
 from slimsfm.features.nearest import match_nearest
-from slimsfm.features.registry import EXTRACTORS, MATCHERS, load_extractor, load_matcher
+from slimsfm.features.registry import EXTRACTORS, MATCHERS, load_extractor, load_matcher, runs_on_one_core
 
 __all__ = [
     "EXTRACTORS",
@@ -24,6 +24,7 @@ __all__ = [
     "load_extractor",
     "load_matcher",
     "match_nearest",
+    "runs_on_one_core",
     "shrink_factor",
     "unit_rows",
     "unmasked",

@@ -68,6 +68,8 @@ MATCHERS = {
 }
 """Import paths of the built-in matchers."""
 
+_ON_ONE_CORE = {"nearest", "sift"}
+
 EXPORTABLE = {
     "aliked-n16": "slimsfm.methods.aliked:exportable",
     "aliked-t16": "slimsfm.methods.aliked:exportable",
@@ -104,6 +106,14 @@ def load_matcher(name: str, features: str) -> Matcher:
             needs is missing.
     """
     return load_method("matcher", MATCHERS, name, {"features": features})
+
+
+def runs_on_one_core(method: str) -> bool:
+    """Whether an extractor or a matcher needs one core, so that several processes share its work.
+
+    Networks use all cores, or the GPU, in one process, and their results may depend on the number of threads.
+    """
+    return method in _ON_ONE_CORE
 
 
 def descriptor_metric_of(extractor: str) -> NearestOptions:

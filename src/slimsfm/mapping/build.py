@@ -8,10 +8,12 @@ from typing import cast
 
 from slimsfm.devices import Device
 from slimsfm.errors import InputError, ReconstructionError
+from slimsfm.execution import OpenExecutor
 from slimsfm.exif import Exif, ignored_values, read_device, read_exif, read_orientation
 from slimsfm.features import Extractor, load_extractor
 from slimsfm.files import working_folder
 from slimsfm.geometry import Box
+from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import Extracted, check_readable, extract_features, guess_cameras
@@ -35,7 +37,9 @@ def build_map(
     *,
     known: KnownPoses | None = None,
     workspace: str | Path | None = None,
+    open_executor: OpenExecutor | None = None,
     progress: ProgressBar = silent,
+    min_seconds: float = Workers.min_seconds,
 ) -> Map:
     """Build a map from a folder of photos by Structure from Motion.
 
@@ -50,8 +54,11 @@ def build_map(
         known: Known poses: points are triangulated and nothing else is estimated.
         workspace: Folder that keeps the intermediate files: COLMAP's database, model and the features. An
             equal call goes on from those that an interrupted one left; another call starts afresh. By
-            default a temporary folder that is removed.
+            default a temporary folder that is removed. Workers open it.
+        open_executor: Opens the executor that extracts and matches features; None: this process. The map has
+            equal bytes in any case.
         progress: Progress callback.
+        min_seconds: As in `Workers`.
 
     Raises:
         InputError: The folder, a mask or the box cannot be used, or fewer than two images can.
@@ -62,6 +69,7 @@ def build_map(
     names = list(found.names) if found else sorted(known.cam_from_world if known else ())
     notes = found.notes if found else ()
     _check_enough(images, names, notes)
+    workers = Workers(open_executor=open_executor, min_seconds=min_seconds)
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
     photos = MaskedPhotos(images, names, options.masks, options.alpha, options.orientation)
@@ -70,13 +78,13 @@ def build_map(
     guess_cameras(exifs, options.camera, options.orientation)  # fails before the long work
     with _opened(workspace) as folder, colmap_warnings():
         space = Workspace(folder, build_key(images, names, photos, extractor, options, known))
-        extracted = _extract(photos, skipped.left(names), extractor, space, skipped, progress)
+        extracted = _extract(photos, skipped.left(names), extractor, space, skipped, workers, progress)
         names = skipped.left(names)
         notes = (*notes, *skipped.notes)
         _check_enough(images, names, notes)
         photos.keep(names)
         exifs = {name: exifs[name] for name in names} if exifs else {}
-        work = _work(images, photos, names, space, exifs, known, options, progress)
+        work = _work(images, photos, names, space, exifs, known, options, workers, progress)
         notes = (*notes, *ignored_values(exifs))
         try:
             parts = _build(work, extracted, extractor, options)
@@ -106,11 +114,12 @@ def _extract(
     extractor: Extractor,
     workspace: Workspace,
     skipped: SkippedPhotos,
+    workers: Workers,
     progress: ProgressBar,
 ) -> Extracted | None:
     """Extract features or, for an extractor that finds no keypoints, only find out what can be read."""
     if not isinstance(extractor, ModelBuilder):
-        return extract_features(photos, names, extractor, workspace, skipped, progress)
+        return extract_features(photos, names, extractor, workspace, skipped, workers, progress)
     check_readable(photos, names, skipped)
     return None
 
@@ -123,6 +132,7 @@ def _work(
     exifs: Mapping[str, Exif],
     known: KnownPoses | None,
     options: BuildOptions,
+    workers: Workers,
     progress: ProgressBar,
 ) -> BuildWork:
     guessed = guess_cameras(exifs, options.camera, options.orientation)
@@ -134,6 +144,7 @@ def _work(
         cameras={name: known.cameras[name] for name in names} if known else guessed.by_name,
         turned=guessed.turned,
         known=known,
+        workers=workers,
         progress=progress,
     )
 

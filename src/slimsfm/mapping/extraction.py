@@ -2,21 +2,24 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
 import pycolmap
 from jaxtyping import UInt8
 
-from slimsfm.errors import InputError
+from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import Exif
-from slimsfm.features import Extractor, Features, image_colors
+from slimsfm.features import Extractor, Features, image_colors, runs_on_one_core
 from slimsfm.features.store import FeatureFile, FeatureWriter
+from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.masked_photos import MaskedPhotos
-from slimsfm.mapping.workspace import FEATURES, Workspace, load_arrays, resumed, save_arrays
+from slimsfm.mapping.workspace import FEATURES, Arrays, Workspace, load_arrays, resumed, save_arrays
 from slimsfm.photos import Orientation
-from slimsfm.progress import ProgressBar
+from slimsfm.progress import ProgressBar, silent
 from slimsfm.skipping import SkippedPhotos
 
 CameraSharing = Literal["auto", "shared", "per-image"]
@@ -101,7 +104,8 @@ def extract_features(
     extractor: Extractor,
     workspace: Workspace,
     skipped: SkippedPhotos,
-    progress: ProgressBar,
+    workers: Workers = Workers(),
+    progress: ProgressBar = silent,
 ) -> Extracted:
     """Extract the features of the photos that can be read, except of those that an interrupted build had.
 
@@ -109,9 +113,14 @@ def extract_features(
         ImageError: No photo can be read or, if `skipped` is strict, one or its mask cannot.
     """
     left = [name for name in names if not _recall(photos, name, workspace)]
-    for name in progress(left, resumed("extract features", len(names) - len(left))):
-        with skipped.skipping(name):
-            _extract(photos, name, extractor, workspace)
+    workers = workers if runs_on_one_core(extractor.name) else Workers()
+    with closing(workers.in_order(partial(_extract, photos.absolute(), extractor), left)) as found:
+        for name in progress(left, resumed("extract features", len(names) - len(left))):
+            with skipped.skipping(name):
+                if isinstance(arrays := next(found), str):
+                    raise photos.error(name, arrays)
+                save_arrays(workspace.extracted(name), arrays)
+                _recall(photos, name, workspace)
     colors, output = {}, workspace.folder / FEATURES
     with FeatureWriter(output) as writer:
         for name in skipped.left(names):
@@ -121,8 +130,12 @@ def extract_features(
     return Extracted(features=FeatureFile(output), colors=colors)
 
 
-def _extract(photos: MaskedPhotos, name: str, extractor: Extractor, workspace: Workspace) -> None:
-    photo = photos.read(name)
+def _extract(photos: MaskedPhotos, extractor: Extractor, name: str) -> Arrays | str:
+    """The features of a photo, or why it cannot be read: a task that raises an error would be tried again."""
+    try:
+        photo = photos.read(name)
+    except ImageError as error:
+        return photos.reason(name, error)
     found = extractor.extract(photo.image, photo.mask)
     arrays = {
         "keypoints": found.keypoints,
@@ -134,7 +147,7 @@ def _extract(photos: MaskedPhotos, name: str, extractor: Extractor, workspace: W
     }
     if found.frames is not None:
         arrays["frames"] = found.frames
-    save_arrays(workspace.extracted(name), arrays)
+    return arrays
 
 
 def _recall(photos: MaskedPhotos, name: str, workspace: Workspace) -> bool:

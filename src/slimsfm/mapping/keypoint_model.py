@@ -7,18 +7,19 @@ from pathlib import Path
 import pycolmap
 
 from slimsfm.errors import ReconstructionError
-from slimsfm.features import Extractor, Features, load_matcher
+from slimsfm.features import Extractor, Features, load_matcher, runs_on_one_core
 from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.diagnosis import diagnose
 from slimsfm.mapping.extraction import Extracted, color_points
+from slimsfm.mapping.matching import PairMatching, match_and_verify
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
-from slimsfm.mapping.pairs import choose_pairs, match_pairs_with, verify_pairs
+from slimsfm.mapping.pairs import choose_pairs, unsure_pairs
 from slimsfm.mapping.reconstruction import reconstruct
-from slimsfm.mapping.scratch import match_pairs, put_keypoints, verified_matches, write_database
+from slimsfm.mapping.scratch import put_keypoints, verified_matches, write_database, write_geometries
 from slimsfm.mapping.sfm import triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.work import BuildOptions, BuildWork, MapParts
-from slimsfm.mapping.workspace import DATABASE, SFM
+from slimsfm.mapping.workspace import DATABASE, FEATURES, SFM
 
 _FEW = 0.5  # share of the photos below which a map needs an explanation
 
@@ -33,7 +34,7 @@ def build_from_keypoints(
         ReconstructionError: The images give no model; says what they lack.
     """
     features = extracted.features
-    sideways = TurnedFeatures(features, dict.fromkeys(work.turned, 1))
+    sideways = TurnedFeatures(features, _turns(work))
     shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
     database = _match(work, features, shrunk, options)
     picked = _reconstruct(work, database, shrunk, options) if work.known is None else None
@@ -46,6 +47,10 @@ def build_from_keypoints(
         put_keypoints(model, features)
     color_points(model, extracted.colors)
     return MapParts(extractor=extractor, model=model, features=features, matches=matches, picked=picked)
+
+
+def _turns(work: BuildWork) -> dict[str, int]:
+    return dict.fromkeys(work.turned, 1)
 
 
 def _triangulate(work: BuildWork, database: Path, options: BuildOptions) -> pycolmap.Reconstruction:
@@ -82,17 +87,20 @@ def _lacking(work: BuildWork, database: Path, shrunk: ShrunkImages) -> str:
 def _match(
     work: BuildWork, features: Mapping[str, Features], shrunk: ShrunkImages, options: BuildOptions
 ) -> Path:
-    names, pairs = list(features), choose_pairs(features, options.pairs, seed=options.seed)
-
-    def write(database: Path) -> None:
-        write_database(database, shrunk.features, shrunk.cameras)
-
-    if (options.extractor, options.matcher) == ("sift", "nearest"):  # COLMAP's own matcher is faster
-        database = work.workspace.database(names, write)
-        match_pairs(database, names, pairs, seed=options.seed, progress=work.progress)
-        return database
-    matcher = load_matcher(options.matcher, options.extractor)
-    matches = match_pairs_with(matcher, features, pairs, work.workspace, work.progress)
-    write(database := work.workspace.folder / DATABASE)
-    verify_pairs(database, names, matches, seed=options.seed, progress=work.progress)
+    """The database of the photos with their verified matches."""
+    database, names = work.workspace.folder / DATABASE, list(features)
+    matching = PairMatching(
+        features=work.workspace.folder / FEATURES,
+        turns=_turns(work),
+        factors=shrunk.factors,
+        cameras=shrunk.cameras,
+        matcher=load_matcher(options.matcher, options.extractor),
+        one_thread=runs_on_one_core(options.matcher),
+        seed=options.seed,
+    )
+    pairs = choose_pairs(features, options.pairs, seed=options.seed)
+    unsure = unsure_pairs(names, pairs, options.pairs) if options.extractor == "sift" else frozenset()
+    geometries = match_and_verify(matching, pairs, work.workspace, work.workers, work.progress, unsure=unsure)
+    write_database(database, shrunk.features, shrunk.cameras)
+    write_geometries(database, names, geometries)
     return database

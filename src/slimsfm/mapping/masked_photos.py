@@ -10,6 +10,7 @@ features either, unless they are told to.
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -19,6 +20,7 @@ from slimsfm.errors import ImageError, InputError
 from slimsfm.files import inside
 from slimsfm.image_files import FoundImages, find_images, named
 from slimsfm.photos import Orientation, Photo, as_stored, read_photo, read_stored_mask, upright
+from slimsfm.skipping import reason_of
 
 AlphaUse = Literal["mask", "ignore"]
 """What transparency does: fully transparent pixels hold no features, or are like any others."""
@@ -75,6 +77,22 @@ class MaskedPhotos:
         self._unused_masks: set[str] = set()
         if masks is not None:
             self._find(Path(masks))
+
+    def absolute(self) -> "MaskedPhotos":
+        """The same photos by absolute paths, for processes with another working folder."""
+        same = copy(self)
+        same._folder = self._folder.absolute()
+        same._mask_folder = self._mask_folder and self._mask_folder.absolute()
+        same._masks = {name: path.absolute() for name, path in self._masks.items()}
+        return same
+
+    def reason(self, name: str, error: ImageError) -> str:
+        """What an error says about a photo, without its path."""
+        return reason_of(error, self._folder / name)
+
+    def error(self, name: str, reason: str) -> ImageError:
+        """The error of a photo that cannot be read for this reason."""
+        return ImageError(f"{self._folder / name}: {reason}")
 
     def read(self, name: str) -> MaskedPhoto:
         """Read a photo and combine its mask with its transparency.

@@ -1,21 +1,15 @@
-"""Choose pairs of images, match them by any matcher, and verify the matches by two-view geometry."""
+"""Choose pairs of images to match."""
 
 import re
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from itertools import combinations
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float32, Int64
 
-from slimsfm.arrays import IndexPairs
-from slimsfm.features import Features, Matcher, unit_rows
+from slimsfm.features import Features, unit_rows
 from slimsfm.features.nearest import learn_words, vlad
-from slimsfm.mapping.workspace import Workspace
-from slimsfm.progress import ProgressBar, silent, single_step
 
 Pairs = list[tuple[str, str]]
 """Pairs of image names: each pair is sorted, and so is the list, without duplicates."""
@@ -25,8 +19,8 @@ Matches = Mapping[tuple[str, str], Int64[np.ndarray, "_ 2"]]
 
 PairChoice = Literal["auto", "exhaustive", "sequential", "similar"]
 
-_MOST_EXHAUSTIVE = 200  # images up to which "auto" is exhaustive
-_CACHED = 256  # images whose features are kept in memory
+_MOST_EXHAUSTIVE = 200  # images up to which "auto" tries all pairs
+_MOST_SURE = 60  # images up to which "auto" matches all of them
 _WORD_SAMPLES = 50_000  # descriptors that the vocabulary is learned from
 
 
@@ -39,6 +33,14 @@ def choose_pairs(features: Mapping[str, Features], choice: PairChoice, *, seed: 
         return sequential_pairs(names)
     similar = similar_pairs(names, _global_descriptors(features, seed))
     return similar if choice == "similar" else sorted({*sequential_pairs(names), *similar})
+
+
+def unsure_pairs(names: Iterable[str], pairs: Pairs, choice: PairChoice) -> frozenset[tuple[str, str]]:
+    """The pairs to match only if they look alike: with "auto", of many images those that are no neighbors."""
+    names = list(names)
+    if choice != "auto" or len(names) <= _MOST_SURE:
+        return frozenset()
+    return frozenset(pairs).difference(sequential_pairs(names))
 
 
 def _global_descriptors(features: Mapping[str, Features], seed: int) -> Float32[np.ndarray, "n kd"]:
@@ -85,36 +87,3 @@ def in_order(names: Iterable[str]) -> list[str]:
 def _natural(name: str) -> list[tuple[int, int, str]]:
     parts = re.split(r"(\d+)", name)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
-
-
-def match_pairs_with(
-    matcher: Matcher,
-    features: Mapping[str, Features],
-    pairs: Pairs,
-    workspace: Workspace,
-    progress: ProgressBar = silent,
-) -> dict[tuple[str, str], IndexPairs]:
-    """Match pairs of images by their features; pairs without a match are omitted."""
-    read = lru_cache(_CACHED)(features.__getitem__)
-    found = workspace.match(pairs, lambda a, b: matcher.match(read(a), read(b)), progress, "match pairs")
-    return {pair: matches for pair, matches in found.items() if len(matches)}
-
-
-def verify_pairs(
-    database: Path,
-    names: list[str],
-    matches: Mapping[tuple[str, str], IndexPairs],
-    *,
-    seed: int,
-    progress: ProgressBar = silent,
-) -> None:
-    """Write matches to a database whose images are numbered from 1 in order of names, and verify them."""
-    ids = {name: image_id for image_id, name in enumerate(names, start=1)}
-    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
-        for (a, b), pairs in sorted(matches.items()):
-            opened.write_matches(ids[a], ids[b], pairs.astype(np.uint32))
-    verifier, geometry = pycolmap.GeometricVerifierOptions(), pycolmap.TwoViewGeometryOptions()
-    verifier.num_threads = 1  # with more, equal matches may give unequal inliers
-    geometry.ransac.random_seed = seed
-    with single_step(progress, "verify matches"):
-        pycolmap.geometric_verification(database, verifier, two_view_geometry_options=geometry)

@@ -9,12 +9,11 @@ from jaxtyping import Float32
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.features import Features
-from slimsfm.mapping.pairs import Pairs
-from slimsfm.mapping.workspace import resumed
-from slimsfm.progress import ProgressBar, counted, silent
 
 _JITTER_PX, _ON_GRID = 0.05, 1e-3  # pixels
-_BLOCK = 200  # pairs that COLMAP matches per call
+
+Geometries = Mapping[tuple[str, str], pycolmap.TwoViewGeometry]
+"""Two-view geometries and their inliers by pair of image names."""
 
 
 def write_database(
@@ -34,7 +33,7 @@ def write_database(
 
 
 def _write_features(database: pycolmap.Database, image_id: int, features: Features) -> None:
-    database.write_keypoints(image_id, _off_grid(features.keypoints))
+    database.write_keypoints(image_id, off_grid(features.keypoints))
     if features.descriptors.dtype == np.uint8:
         descriptors = pycolmap.FeatureDescriptors(
             type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors
@@ -91,7 +90,7 @@ def _write_image(database: pycolmap.Database, image_id: int, name: str, camera_i
     database.write_frame(frame, use_frame_id=True)
 
 
-def _off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
+def off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2"]:
     """Keypoints, moved by up to 0.05 pixels if all of them lie on a grid of half pixels.
 
     On an exact grid, COLMAP's solver for unknown focal lengths may crash the process.
@@ -103,45 +102,19 @@ def _off_grid(keypoints: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 2
 
 
 def put_keypoints(model: pycolmap.Reconstruction, features: Mapping[str, Features]) -> None:
-    """Set the keypoints of a model's images to those of their features, without the shift of `_off_grid`."""
+    """Set the keypoints of a model's images to those of their features, without the shift of `off_grid`."""
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
         for point, xy in zip(image.points2D, features[image.name].keypoints, strict=True):
             point.xy = xy.astype(np.float64)
 
 
-def match_pairs(
-    database: Path, names: list[str], pairs: Pairs, *, seed: int, progress: ProgressBar = silent
-) -> None:
-    """Match pairs of images by their SIFT descriptors and verify the matches by two-view geometry.
-
-    Pairs whose verified matches the database already has stay as they are.
-    """
+def write_geometries(database: Path, names: list[str], geometries: Geometries) -> None:
+    """Write verified matches to a database whose images are numbered from 1 in order of names."""
     ids = {name: image_id for image_id, name in enumerate(names, start=1)}
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = database.with_suffix(".pairs.txt")
-    with pycolmap.Database.open(database) as opened:
-        left = [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]
-    with counted(progress, len(left), resumed("match pairs", len(pairs) - len(left))) as advance_to:
-        for start in range(0, len(left), _BLOCK):
-            block = left[start : start + _BLOCK]
-            Path(pairing.match_list_path).write_text("".join(f"{ids[a]} {ids[b]}\n" for a, b in block))
-            pycolmap.match_image_pairs(
-                database,
-                matching_options=_matching_options(),
-                pairing_options=pairing,
-                verification_options=verification,
-            )
-            advance_to(start + len(block))
-
-
-def _matching_options() -> pycolmap.FeatureMatchingOptions:
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = 1  # with more, equal images sometimes give unequal matches
-    options.use_gpu = False
-    return options
+    with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
+        for (a, b), geometry in sorted(geometries.items(), key=lambda item: item[0]):
+            opened.write_two_view_geometry(ids[a], ids[b], geometry)
 
 
 def verified_matches(database: Path, names: Mapping[int, str]) -> dict[tuple[str, str], IndexPairs]:
@@ -157,7 +130,3 @@ def verified_matches(database: Path, names: Mapping[int, str]) -> dict[tuple[str
                 key = (names[a], names[b]) if ordered else (names[b], names[a])
                 found[key] = pairs if ordered else pairs[:, ::-1]
         return {key: found[key][np.argsort(found[key][:, 0], kind="stable")] for key in sorted(found)}
-
-
-# Mapping runs on one thread, also in the libraries below: with more, equal input gives unequal models, and
-# mapping is hardly faster.

@@ -77,11 +77,15 @@ class _Shrunk(Mapping[str, Features]):
         self._whole, self._factors = whole, factors
 
     def __getitem__(self, name: str) -> Features:
-        features, factor = self._whole[name], self._factors[name]
-        return replace(features, keypoints=(features.keypoints / factor).astype(np.float32))
+        return shrunk_features(self._whole[name], self._factors[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._whole)
 
     def __len__(self) -> int:
         return len(self._whole)
+
+
+def shrunk_features(features: Features, factor: float) -> Features:
+    """Features in pixels of an image that is smaller by a factor."""
+    return replace(features, keypoints=(features.keypoints / factor).astype(np.float32))

@@ -14,6 +14,7 @@ from slimsfm.arrays import Image
 from slimsfm.features import Extractor, Features
 from slimsfm.geometry import Box
 from slimsfm.lenses import camera_fault
+from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.choice import PickedModel
 from slimsfm.mapping.extraction import CameraSharing
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
@@ -38,7 +39,8 @@ class BuildOptions:
 
     pairs: PairChoice = "auto"
     """Pairs of images to match: all (exhaustive), neighbors in order of name (sequential), or images that
-    look alike (similar). auto: exhaustive up to 200 images, otherwise sequential and similar; without a
+    look alike (similar). auto: exhaustive up to 200 images, otherwise sequential and similar, and above 60
+    images without pairs that are no neighbors and whose largest SIFT features do not match; without a
     detector, exhaustive up to 30 images, otherwise by pose if poses are known, else sequential."""
 
     masks: Path | None = None
@@ -172,6 +174,9 @@ class BuildWork:
 
     known: KnownPoses | None
     """Known poses, if any: then points are triangulated and nothing else is estimated."""
+
+    workers: Workers
+    """Who matches pairs of images."""
 
     progress: ProgressBar
     """Progress callback."""

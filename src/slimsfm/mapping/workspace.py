@@ -2,10 +2,9 @@
 
     build.json           what the files are of: photos, options and versions; others start afresh
     extracted/*.npz      features and colors of a photo, a file each
-    matched/*.npz        matches of a block of pairs, a file each; not of COLMAP's own matcher
+    matched/*.npz        matches of a block of pairs, a file each
     features.h5          all features, for reading
-    database.db          COLMAP's database, with verified matches
-    database.images      the images whose features the database holds
+    database.db          COLMAP's database, with verified matches; written afresh
     sfm/                 models and their databases; never resumed
 
 A file appears under its name when it is complete, so that a process may be killed at any moment.
@@ -14,8 +13,8 @@ A file appears under its name when it is complete, so that a process may be kill
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,14 +23,17 @@ import numpy as np
 
 from slimsfm.files import remove
 from slimsfm.files.resumable import KEY_FILE
-from slimsfm.progress import ProgressBar
+from slimsfm.progress import ProgressBar, counted
 
-Array = np.ndarray
+Arrays = dict[str, np.ndarray]
+
+Block = list[tuple[str, str]]
+"""Pairs of names that are matched together."""
 
 FEATURES, DATABASE, SFM = "features.h5", "database.db", "sfm"
-_EXTRACTED, _MATCHED, _IMAGES = "extracted", "matched", "database.images"
-_BLOCK = 20  # pairs of a file of matches
-_LATEST = (FEATURES, DATABASE, f"{DATABASE}-shm", f"{DATABASE}-wal", _EXTRACTED, _MATCHED, _IMAGES)
+_EXTRACTED, _MATCHED = "extracted", "matched"
+_BLOCK = 10  # pairs of a file of matches: about a second of work
+_LATEST = (FEATURES, DATABASE, f"{DATABASE}-shm", f"{DATABASE}-wal", _EXTRACTED, _MATCHED)
 
 
 class Workspace:
@@ -58,45 +60,40 @@ class Workspace:
         """The file of the features of an image."""
         return self.folder / _EXTRACTED / f"{_digest(name)}.npz"
 
-    def database(self, names: Sequence[str], write: Callable[[Path], None]) -> Path:
-        """The database that holds the features of these images, with the matches so far, or a new one."""
-        path, images, text = self.folder / DATABASE, self.folder / _IMAGES, json.dumps(list(names))
-        if not (path.is_file() and images.is_file() and images.read_text() == text):
-            images.unlink(missing_ok=True)
-            for suffix in ("", "-shm", "-wal"):
-                remove(Path(f"{path}{suffix}"))
-            write(path)
-            write_whole(images, text.encode())
-        return path
-
-    def match(
+    def in_blocks(
         self,
         pairs: Sequence[tuple[str, str]],
-        match: Callable[[str, str], Array],
+        solve: Callable[[Sequence[Block]], Generator[Arrays, None, None]],
         progress: ProgressBar,
         label: str,
-    ) -> dict[tuple[str, str], Array]:
-        """Match pairs of images, without those that an interrupted build matched.
+    ) -> list[tuple[Block, Arrays]]:
+        """Do work on blocks of pairs of images, without those that an interrupted build did.
 
         Args:
             pairs: Pairs of names.
-            match: Matches the images of two names; returns an array.
-            progress: Progress callback, of the pairs that are matched now.
+            solve: Does the work; yields the result of each block, in order.
+            progress: Progress callback, of the pairs that are left.
             label: What is done, for the progress.
 
         Returns:
-            The result of `match` for each pair, in the order of the pairs.
+            All blocks and their results, in the order of the pairs.
         """
-        blocks = [tuple(pairs[start : start + _BLOCK]) for start in range(0, len(pairs), _BLOCK)]
-        files = {block: self.folder / _MATCHED / f"{_digest(block)}.npz" for block in blocks}
-        found = {block: list(saved.values()) for block in blocks if (saved := load_arrays(files[block]))}
-        left = [(block, pair) for block in blocks if block not in found for pair in block]
-        done = len(pairs) - len(left)
-        for block, pair in progress(left, resumed(label, done)):
-            found.setdefault(block, []).append(match(*pair))
-            if pair == block[-1]:
-                save_arrays(files[block], {f"{i:04}": one for i, one in enumerate(found[block])})
-        return {pair: one for block in blocks for pair, one in zip(block, found[block], strict=True)}
+        blocks = [list(pairs[start : start + _BLOCK]) for start in range(0, len(pairs), _BLOCK)]
+        files = [self.folder / _MATCHED / f"{_digest(block)}.npz" for block in blocks]
+        found = [load_arrays(file) for file in files]
+        left = [row for row, arrays in enumerate(found) if arrays is None]
+        done = len(pairs) - sum(len(blocks[row]) for row in left)
+        with (
+            counted(progress, len(pairs) - done, resumed(label, done)) as advance_to,
+            closing(solve([blocks[row] for row in left])) as solved,
+        ):
+            solved_pairs = 0
+            for row, arrays in zip(left, solved, strict=True):
+                save_arrays(files[row], arrays)
+                found[row] = arrays
+                solved_pairs += len(blocks[row])
+                advance_to(solved_pairs)
+        return [(block, arrays) for block, arrays in zip(blocks, found, strict=True) if arrays]
 
 
 def resumed(label: str, done: int) -> str:
@@ -104,13 +101,13 @@ def resumed(label: str, done: int) -> str:
     return f"{label} ({done} done before)" if done else label
 
 
-def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays to a file that appears when it is complete."""
     with _whole(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def load_arrays(path: Path) -> dict[str, Array] | None:
+def load_arrays(path: Path) -> Arrays | None:
     """Read arrays in the order in which they were written; None if the file is missing or damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:

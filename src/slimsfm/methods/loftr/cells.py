@@ -6,7 +6,7 @@ References:
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 from slimsfm.arrays import IndexPairs, Points2D
 from slimsfm.features import Features, unmasked
 from slimsfm.mapping.pairs import Matches, Pairs
-from slimsfm.mapping.workspace import Workspace
+from slimsfm.mapping.workspace import Arrays, Block, Workspace
 from slimsfm.progress import ProgressBar, silent
 
 # Without named sizes, because one call may take several images of different sizes.
@@ -160,9 +160,16 @@ def match_without_keypoints(
         matches = matcher.match_cells(encode(a), encode(b))
         return _within(matches, (masks or {}).get(a), (masks or {}).get(b)).as_rows()
 
+    def solve(blocks: Sequence[Block]) -> Generator[Arrays, None, None]:
+        return ({f"{row:04}": match(*pair) for row, pair in enumerate(block)} for block in blocks)
+
     tiled = in_tiles(pairs, _CACHED // 2)
-    rows = workspace.match(tiled, match, progress, "match images")
-    found = {pair: ImageMatches.of_rows(some) for pair, some in rows.items()}
+    solved = workspace.in_blocks(tiled, solve, progress, "match images")
+    found = {
+        pair: ImageMatches.of_rows(rows)
+        for block, arrays in solved
+        for pair, rows in zip(block, arrays.values(), strict=True)
+    }
     names = sorted(photos)
     cells = _numbered(names, {pair: found[pair] for pair in sorted(found)})
     return CellKeypoints(

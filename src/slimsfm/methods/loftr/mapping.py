@@ -19,9 +19,10 @@ from slimsfm.arrays import IndexPairs, Mask, Points2D
 from slimsfm.features import Features, image_colors
 from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.extraction import color_points
-from slimsfm.mapping.pairs import Matches, Pairs, verify_pairs
+from slimsfm.mapping.matching import verify_matches
+from slimsfm.mapping.pairs import Matches, Pairs
 from slimsfm.mapping.reconstruction import reconstruct
-from slimsfm.mapping.scratch import verified_matches, write_database
+from slimsfm.mapping.scratch import verified_matches, write_database, write_geometries
 from slimsfm.mapping.sfm import adjust, triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.workspace import DATABASE, SFM, Workspace
@@ -290,7 +291,8 @@ def _reconstruct(
     for camera in small.values():
         camera.has_prior_focal_length |= cam_from_world is not None
     write_database(database, shrunk.features, small)
-    verify_pairs(database, names, cells.matches, seed=seed, progress=progress)
+    geometries = verify_matches(shrunk.features, small, cells.matches, seed=seed, progress=progress)
+    write_geometries(database, names, geometries)
     picked = None
     if cam_from_world is not None:
         model = triangulate(database, names, folder / SFM, cam_from_world, seed=seed, progress=progress)
