@@ -120,13 +120,8 @@ def test_poses_with_estimated_intrinsics_stay_as_they_are(boulder):
     wrong.params = wrong.params * np.array([1.3, *np.ones(len(wrong.params) - 1)])
     found = localizer.search(localizer.extractor.extract(read_image(path)), wrong).best
     assert found.pose.camera is not None
-    query = localizer._query(localizer.extractor.extract(read_image(path)), wrong)
-    assert (
-        ExactPass(boulder.map, localizer._strategy, PointSizes(boulder.map)).refined(
-            query, found.matches, found.pose, found.camera, RADIUS_PX
-        )
-        is None
-    )
+    exact = ExactPass(boulder.map, localizer._strategy, PointSizes(boulder.map))
+    assert exact.refined(found.query, found.matches, found.pose, found.camera, RADIUS_PX) is None
 
 
 def test_poses_with_gravity_keep_its_prior(boulder, monkeypatch):

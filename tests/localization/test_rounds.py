@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from slimsfm.features import load_extractor
 from slimsfm.localization import LocalizationOptions, Localizer, MultiLocalizer
 from slimsfm.localization.cameras import QueryCamera
-from slimsfm.localization.extraction import SizedExtractor, Window, second_size, usual_first_size
+from slimsfm.localization.extraction import (
+    SMALLEST_SCALE_PX,
+    SizedExtractor,
+    Window,
+    second_size,
+    usual_first_size,
+)
 from slimsfm.localization.rounds import ImageRounds, Seen, StoredRounds, levels_of
 from slimsfm.photos import read_image, shrink
 
@@ -143,7 +149,7 @@ def test_stored_features_are_those_that_a_shrunken_image_would_have(boulder, ext
     source = StoredRounds(features, lambda size: size / 1000)
     whole, small = source.at(extractor, max(features.image_size)), source.at(extractor, 160)
     assert len(whole.features) == len(features) > len(small.features) > 0
-    assert small.features.frames[:, 0].min() >= small.shrink_factor
+    assert small.features.frames[:, 0].min() >= SMALLEST_SCALE_PX * small.shrink_factor
     width, height = features.image_size
     before = source.seconds
     part = source.part(extractor, 160, Window(0, 0, width // 2, height))

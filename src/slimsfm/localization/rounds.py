@@ -170,9 +170,12 @@ class StoredRounds:
 
     def at(self, extractor: SizedExtractor, size: int) -> Extracted:  # noqa: ARG002
         """Features that the shrunken image has too."""
-        factor = max(1.0, max(self.size) / size)
         self.seconds += self._extract_seconds(size)
-        return Extracted(self._features[np.flatnonzero(self._scales >= SMALLEST_SCALE_PX * factor)], factor)
+        factor = max(self.size) / size
+        if factor <= 1:
+            return Extracted(self._features, 1.0)
+        found = np.flatnonzero(self._scales >= SMALLEST_SCALE_PX * factor)
+        return Extracted(self._features[found], factor)
 
     def part(self, extractor: SizedExtractor, size: int, window: Window) -> Extracted:
         """Those of them that lie in the part; their extraction takes time in proportion to its pixels."""

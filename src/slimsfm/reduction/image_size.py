@@ -68,7 +68,7 @@ class SizeTrials:
         """Set the references; 30 of them are used if there are more."""
         places = np.linspace(0, len(tests.names) - 1, min(_MOST_TESTS, len(tests.names)))
         self._tests, self._whole = tests, tests.whole
-        self._names = [tests.names[round(place)] for place in places]
+        self._names = [tests.names[int(place)] for place in places.round()]
         self._outcome = cache(self._localized)
 
     def default(self) -> FirstSize:
