@@ -39,6 +39,7 @@ _WIDE = "I", "F"  # first letters of Pillow's modes of more than eight bits
 _STRIP = (
     256  # rows that are converted at a time, because a large image exists once or twice but not more often
 )
+_SMALL = 4_000_000  # pixels of an image that may exist once more, because that is faster
 _PILLOW_LIMIT = Lock()
 
 
@@ -214,6 +215,8 @@ def _values(
 
 
 def _converted(file: PillowImage.Image, mode: Literal["RGB", "RGBA"]) -> UInt8[np.ndarray, "_ _ channels"]:
+    if file.mode == mode and file.height * file.width <= _SMALL:
+        return np.array(file)
     found = np.empty((file.height, file.width, len(mode)), np.uint8)
     for top in range(0, file.height, _STRIP):
         strip = file.crop((0, top, file.width, min(file.height, top + _STRIP)))
