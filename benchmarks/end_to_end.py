@@ -5,13 +5,15 @@
 A folder of photos is split as everywhere: every third photo is a query. A folder with a `transforms.json` has
 true poses, the poses of other photos come from a reconstruction of all of them. The ways take turns at each
 query, in one run, on all cores: the default reduced map and the full map, each with `--extraction rounds` and
-`--extraction whole`, and the full map matched exhaustively. Times are medians, shares are of queries.
+`--extraction whole`, and the full map matched exhaustively. Times are medians, shares are of queries. The
+forecast of the median time with the reduced map, as `reduce` prints it, is compared with what is measured.
 """
 
 import argparse
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from statistics import geometric_mean
 from time import perf_counter
@@ -20,13 +22,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmark_scenes import Scene, rendered, scenes
+from deceptive_scenes import deception
 from posed_scenes import posed
 from slimsfm.evaluation.results import PosedQuery, outcomes_of
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.photos import read_photo
 from slimsfm.progress import shown
-from slimsfm.reduction import reduce
+from slimsfm.reduction import measure_speed, reduce
 
 WAYS = {
     "slim, whole": ("slim", LocalizationOptions(extraction="whole")),
@@ -65,16 +68,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="*", help="folders of photos")
     parser.add_argument("--objects", nargs="*", default=[], help="rendered objects")
+    parser.add_argument("--deceptions", nargs="*", default=[], help="deceptive scenes, see deception.py")
     parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS))
     parser.add_argument("--most", type=int, default=40, help="queries per scene, evenly spaced")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for maps")
     options = parser.parse_args()
     rows: list[Row] = []
     print(f"{HEADER}\n|{13 * '---|'}")
-    for scene in _scenes(options.folders, options.objects, options.output):
-        for row in _measured(scene, options.ways, options.most, options.output):
-            rows.append(row)
+    made = chain(
+        _scenes(options.folders, options.objects, options.output),
+        (deception(name, options.output) for name in options.deceptions),
+    )
+    for scene in made:
+        measured = _measured(scene, options.ways, options.most, options.output)
+        rows += measured
+        for row in measured:
             _print(row)
+        _print_forecast(scene, measured, options.output)
     _summarize(rows)
     (options.output / "end_to_end.json").write_text(json.dumps([vars(row) for row in rows], indent=1))
 
@@ -171,6 +181,16 @@ def _print(row: Row) -> None:
         f"| {row.median_error:.5f} | {row.p90_error:.5f} | {metric} | {row.confident_wrong} |",
         flush=True,
     )
+
+
+def _print_forecast(scene: Scene, rows: list[Row], output: Path) -> None:
+    forecast = measure_speed(scene.references, _slim(scene, output))
+    found = [row.query_ms for row in rows if row.way == "slim, rounds"]
+    if forecast and found:
+        predicted = 1e3 * forecast.slim.total
+        print(
+            f"{scene.name}: forecast {predicted:.1f} ms, {predicted / found[0]:.2f} times what was measured"
+        )
 
 
 def _summarize(rows: list[Row]) -> None:
