@@ -1,6 +1,7 @@
 """Mutual nearest neighbors that pass the ratio test, and global descriptors (VLAD)."""
 
 import warnings
+from threading import local
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -11,6 +12,7 @@ from slimsfm.features.base import Features, NearestOptions, unit_rows
 from slimsfm.features.registry import descriptor_metric_of
 
 _BLOCK = 256  # rows
+_MOST_REUSED = 4_000_000  # numbers in memory that is kept
 
 
 class Nearest:
@@ -61,7 +63,7 @@ def _nearest_two(
     transposed = descriptors2.T
     if len(descriptors1) > _BLOCK:  # for one block the copy takes longer than the product
         transposed = np.ascontiguousarray(transposed)
-    memory = np.empty((_BLOCK, len(descriptors2)), np.float32)  # reused: new pages are expensive
+    memory = _memory(_BLOCK, len(descriptors2))
     for start in range(0, len(descriptors1), _BLOCK):
         block = slice(start, start + _BLOCK)
         rows = np.arange(len(descriptors1[block]))
@@ -72,6 +74,19 @@ def _nearest_two(
         cosines[rows, nearest[block]] = -1
         second[block] = cosines.max(axis=1)
     return nearest, best, second, best_of_column
+
+
+_REUSED = local()
+
+
+def _memory(rows: int, columns: int) -> Float32[np.ndarray, "rows columns"]:
+    """Memory of this thread that is used again and again: new pages are expensive."""
+    size = rows * columns
+    if size > _MOST_REUSED:
+        return np.empty((rows, columns), np.float32)
+    if getattr(_REUSED, "memory", np.empty(0)).size < size:
+        _REUSED.memory = np.empty(size, np.float32)
+    return _REUSED.memory[:size].reshape(rows, columns)
 
 
 def _angles(cosines: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
