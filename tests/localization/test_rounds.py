@@ -15,8 +15,8 @@ from slimsfm.localization.extraction import (
     SMALLEST_SCALE_PX,
     SizedExtractor,
     Window,
+    first_size,
     second_size,
-    usual_first_size,
 )
 from slimsfm.localization.rounds import ImageRounds, Seen, StoredRounds, levels_of
 from slimsfm.photos import read_image, shrink
@@ -73,7 +73,7 @@ def extractor(boulder):
 def test_without_a_pose_images_grow_up_to_the_whole(view, extractor):
     longer = max(view.shape)
     sizes = asked(ImageRounds(view), extractor, Seen())
-    assert sizes[0] == usual_first_size(longer)
+    assert sizes[0] == first_size(longer)
     assert sizes[-1] == longer
     assert sizes == sorted(set(sizes))
 
@@ -101,7 +101,7 @@ def test_the_whole_image_gives_what_the_extractor_gives(view, extractor):
 def test_a_part_has_the_features_of_the_whole_image_in_its_pixels(view, extractor):
     window = Window(60, 40, 260, 200)
     whole = extractor.whole.extract(view).keypoints
-    found = extractor.extract_part(view, None, max(view.shape), window)
+    found = extractor.extract(view, None, max(view.shape), window)
     assert found.shrink_factor == 1
     assert found.features.image_size == view.shape[1::-1]
     inner = found.features.keypoints[
@@ -114,7 +114,7 @@ def test_a_part_has_the_features_of_the_whole_image_in_its_pixels(view, extracto
 
 def test_a_shrunken_part_has_the_keypoints_of_the_shrunken_image(view, extractor):
     size, window = max(view.shape) // 2, Window(0, 0, view.shape[1], view.shape[0])
-    part = extractor.extract_part(view, None, size, window)
+    part = extractor.extract(view, None, size, window)
     image = extractor.extract(view, None, size)
     assert part.shrink_factor == image.shrink_factor == 2
     nearest = np.linalg.norm(part.features.keypoints[:, None] - image.features.keypoints[None], axis=2)

@@ -22,7 +22,9 @@ from slimsfm.skipping import SkippedPhotos
 
 
 class MultiLocalizer:
-    """Localizes images against several maps; extracts features once for maps with the same extractor.
+    """Localizes images against several maps; maps with the same extractor share what is extracted.
+
+    Features of an image size are extracted once. Maps that begin with different sizes share less.
 
     Attributes:
         localizers: The localizer of each object's map, by name of the object.

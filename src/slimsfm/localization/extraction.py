@@ -1,14 +1,13 @@
 """The extractor of a map, for shrunken images and parts of images, and which sizes these have."""
 
 from dataclasses import replace
-from functools import lru_cache
 from math import ceil, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from slimsfm.arrays import GrayImage, Image, Points2D
-from slimsfm.features import Extractor, Features, load_extractor, shrink_factor
+from slimsfm.features import Features, shrink_factor, unmasked
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 from slimsfm.photos import shrink
@@ -19,18 +18,24 @@ FIRST_SIZES = 128, 160, 200, 240, 280, 320, 360, 400, 480, 560, 640, 800
 SMALLEST_SCALE_PX = 0.9
 """Scale of the smallest keypoints that SIFT finds."""
 
-_FIRST = 0.36  # of the longer side: a seventh of the pixels
+_FIRST = 0.36  # of the longer side: an eighth of the pixels
 _LEAST = 128  # pixels: smaller images are extracted at once
 _MORE_PIXELS = 1 / 3  # of all rounds before the last, relative to the last
 _GROWTH = 1.4  # of the longer side from round to round, at least
 _MARGIN = 0.1  # around the part where points should be, relative to its sides
 _LEAST_MARGIN = 0.02  # of the longer side of the image
-_MOST_SIZES = 16  # extractors that are kept
+_LEAST_SIDE = 32  # pixels of the shorter side: networks need some
 
 
-def usual_first_size(whole: int) -> int:
-    """Longer side of the first image for a map that says nothing of it, in pixels."""
-    return max(_LEAST, round(_FIRST * whole))
+def first_size(whole: int, wanted: int | None = None) -> int:
+    """Longer side of the first image, in pixels; that of the whole image if it would not be much smaller.
+
+    Args:
+        whole: Longer side of the whole image.
+        wanted: What the map says; None if it says nothing.
+    """
+    first = wanted or max(_LEAST, round(_FIRST * whole))
+    return first if first**2 <= _MORE_PIXELS * whole**2 else whole
 
 
 def second_size(whole: int, first: int, share: float = 1.0) -> int | None:
@@ -68,6 +73,7 @@ class Window(NamedTuple):
             return None
         low, high = inside.min(axis=0), inside.max(axis=0)
         margin = _MARGIN * (high - low) + _LEAST_MARGIN * size.max()
+        margin = np.maximum(margin, (_LEAST_SIDE - (high - low)) / 2)
         (left, top), (right, bottom) = np.maximum(low - margin, 0), np.minimum(high + margin, size)
         return cls(int(left), int(top), ceil(right), ceil(bottom))
 
@@ -83,7 +89,7 @@ class Extracted(NamedTuple):
 
 
 class SizedExtractor:
-    """The extractor of a map, for images of several sizes.
+    """The extractor of a map, for shrunken images and parts of them.
 
     Attributes:
         whole: The extractor with the image size of the map.
@@ -92,7 +98,6 @@ class SizedExtractor:
     def __init__(self, map: Map) -> None:
         self.whole = extractor_of(map)
         self._first = map.info.first_image_size
-        self._of_size = lru_cache(_MOST_SIZES)(self._with_size)
 
     @property
     def key(self) -> str:
@@ -107,35 +112,30 @@ class SizedExtractor:
     def first_size(self, width: int, height: int) -> int:
         """Longer side of the first image; that of the whole one if no smaller image is of use."""
         whole = self.whole_size(width, height)
-        if "max_image_size" not in self.whole.options:
-            return whole
-        first = self._first or usual_first_size(whole)
-        return first if first**2 <= _MORE_PIXELS * whole**2 else whole
+        first = first_size(whole, self._first)
+        is_thin = first * min(width, height) < _LEAST_SIDE * max(width, height)
+        return whole if is_thin or "max_image_size" not in self.whole.options else first
 
-    def extract(self, image: Image, mask: GrayImage | None, size: int) -> Extracted:
-        """Extract the features of an image whose longer side is shrunk to `size` pixels."""
+    def extract(
+        self, image: Image, mask: GrayImage | None, size: int, window: Window | None = None
+    ) -> Extracted:
+        """Extract features of an image whose longer side is shrunk to `size` pixels, or of a part of it."""
         height, width = image.shape[:2]
-        is_whole = size >= self.whole_size(width, height)
-        extractor = self.whole if is_whole else self._of_size(size)
-        return Extracted(extractor.extract(image, mask), max(1.0, max(width, height) / size))
-
-    def extract_part(self, image: Image, mask: GrayImage | None, size: int, window: Window) -> Extracted:
-        """Extract the features of a part of an image whose longer side is shrunk to `size` pixels."""
-        height, width = image.shape[:2]
-        part = slice(window.top, window.bottom), slice(window.left, window.right)
-        side = max(window.right - window.left, window.bottom - window.top)
-        wanted = max(1, round(side * size / max(width, height)))
-        small = shrink(np.ascontiguousarray(image[part]), wanted)
-        small_mask = None if mask is None else shrink(np.ascontiguousarray(mask[part]), wanted)
-        found, factor = self.whole.extract(small, small_mask), side / max(small.shape[:2])
-        frames = found.frames
+        if window is None and size >= self.whole_size(width, height):
+            return Extracted(self.whole.extract(image, mask), max(1.0, max(width, height) / size))
+        left, top, right, bottom = window or Window(0, 0, width, height)
+        part = np.ascontiguousarray(image[top:bottom, left:right])
+        small = shrink(part, max(1, round(max(part.shape) * size / max(width, height))))
+        small_mask = None
+        if mask is not None:
+            small_mask = shrink(np.ascontiguousarray(mask[top:bottom, left:right]), max(small.shape[:2]))
+        found = self.whole.extract(small, small_mask)
+        factors = np.array(part.shape[1::-1]) / small.shape[1::-1]
         moved = replace(
             found,
-            keypoints=found.keypoints * np.float32(factor) + np.array([window.left, window.top], np.float32),
+            keypoints=(found.keypoints * factors + (left, top)).astype(np.float32),
             image_size=(width, height),
-            frames=None if frames is None else frames * np.array([factor, 1], np.float32),
+            frames=None if found.frames is None else found.frames * np.array([factors.max(), 1], np.float32),
         )
-        return Extracted(moved, factor * shrink_factor(self.whole.options, *small.shape[1::-1]))
-
-    def _with_size(self, size: int) -> Extractor:
-        return load_extractor(self.whole.name, {**self.whole.options, "max_image_size": size})
+        moved = moved[np.flatnonzero(unmasked(moved.keypoints, mask))]
+        return Extracted(moved, factors.max() * shrink_factor(self.whole.options, *small.shape[1::-1]))

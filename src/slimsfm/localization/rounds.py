@@ -1,6 +1,6 @@
 """Features of a query in rounds, from a small version of the image to the whole one.
 
-Most queries are localized by a seventh of their pixels, and extraction takes time in proportion to them. So
+Most queries are localized by an eighth of their pixels, and extraction takes time in proportion to them. So
 features are extracted from a shrunken image first. If the pose is not sure, a larger image follows, of the
 part where the map's points should be if there is a pose, and finally the whole image. All rounds before the
 last have at most a third of its pixels.
@@ -134,7 +134,7 @@ class ImageRounds:
 
     def part(self, extractor: SizedExtractor, size: int, window: Window) -> Extracted:
         """Features of a part of the shrunken image."""
-        return self._timed(lambda: extractor.extract_part(self.image, self._mask, size, window))
+        return self._timed(lambda: extractor.extract(self.image, self._mask, size, window))
 
     def _timed(self, extract: Callable[[], Extracted]) -> Extracted:
         start = perf_counter()

@@ -86,7 +86,8 @@ class SearchResult:
     """The round that counts, and what all rounds took."""
 
     best: RoundResult
-    """The last round with a pose: it has the matches of all rounds before, and any that contradict them."""
+    """The last round with a pose: it has all matches of the rounds before with the same features, and any
+    that contradict them."""
 
     references: int
     """Number of reference images that the query was matched with."""
@@ -159,8 +160,7 @@ class Search:
         )
         if found is None:
             return best
-        used = found.matches.pixels(shrunk.query)[found.pose.inliers]
-        evidence = self._verifier.determined(best.evidence, found.pose, used, shrunk.camera)
+        evidence = self._verifier.determined(best.evidence, found.pose)
         pose = replace(found.pose, confidence=evidence.confidence)
         return replace(best, matches=found.matches, pose=pose, evidence=evidence)
 
@@ -346,7 +346,8 @@ def suffices(rounds: list[RoundResult], *, is_coarse: bool = False) -> bool:
     last = rounds[-1].evidence
     if last is None or (last.confidence_in_matches if is_coarse else last.confidence) < SURE:
         return False
-    before = rounds[-2].evidence if len(rounds) > 1 else None
+    is_same_image = len(rounds) > 1 and rounds[-2].query is rounds[-1].query
+    before = rounds[-2].evidence if is_same_image else None
     settled = before is not None and last.predicted_error > SETTLED * before.predicted_error
     return settled or (last.predicted_error <= ACCURATE and last.cells >= SPREAD)
 

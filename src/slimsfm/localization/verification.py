@@ -217,9 +217,7 @@ class Verifier:
             determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
         )
 
-    def determined(
-        self, evidence: Evidence, pose: PoseEstimate, inliers: Points2D, camera: pycolmap.Camera
-    ) -> Evidence:
+    def determined(self, evidence: Evidence, pose: PoseEstimate) -> Evidence:
         """The evidence for a pose after it was refined over other matches that were looked for near it.
 
         How well they determine the pose is theirs. What supports and what contradicts it stays, because such
@@ -230,7 +228,6 @@ class Verifier:
             evidence,
             predicted_error=predicted_error,
             uncalibrated_error=self._uncalibrated_error(pose),
-            cells=_cells(inliers, camera),
             determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
         )
 

@@ -134,8 +134,10 @@ def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[
 
 
 def _unpack_sizes(stored: np.ndarray, count: int) -> Float32[np.ndarray, " n"]:
-    if stored.shape != (count,) or stored.dtype != np.float16 or not np.isfinite(stored).all():
+    if stored.shape != (count,) or stored.dtype != np.float16:
         raise ValueError(f"sizes of shape {stored.shape} and type {stored.dtype} for {count} points")
+    if not np.isfinite(stored).all():
+        raise ValueError("sizes that are not finite")
     return np.exp2(np.clip(stored.astype(np.float32), *_LOG2_LIMITS))
 
 

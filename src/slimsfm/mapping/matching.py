@@ -52,6 +52,15 @@ class PairMatching:
     seed: int
     """Seed of the verification."""
 
+    def of(self, pairs: Pairs) -> "PairMatching":
+        """What matching some of the pairs needs."""
+        names = {name for pair in pairs for name in pair}
+        turns, factors, cameras = (
+            {name: one[name] for name in names if name in one}
+            for one in (self.turns, self.factors, self.cameras)
+        )
+        return replace(self, turns=turns, factors=factors, cameras=cameras)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Block:
@@ -93,13 +102,16 @@ def match_and_verify(
 
     def solve(blocks: Sequence[Pairs]) -> Generator[Arrays, None, None]:
         tasks = [
-            _Block(matching=matching, stamp=stamp, pairs=block, unsure=unsure.intersection(block))
+            _Block(matching=matching.of(block), stamp=stamp, pairs=block, unsure=unsure.intersection(block))
             for block in blocks
         ]
         return workers.in_order(_solve, tasks)
 
-    blocks = workspace.in_blocks(pairs, solve, progress, "match pairs")
-    return {pair: one for block in blocks for pair, one in _unpacked(*block)}
+    try:
+        blocks = workspace.in_blocks(pairs, solve, progress, "match pairs")
+        return {pair: one for block in blocks for pair, one in _unpacked(*block)}
+    finally:
+        _reader.cache_clear()
 
 
 def _solve(block: _Block) -> Arrays:

@@ -76,7 +76,7 @@ class Prediction:
         """The prediction with the time of extraction in rounds; the same if sizes cannot be tried."""
         if sizes is None:
             return self
-        return replace(self, seconds=replace(self.seconds, extract=sizes.default().extract_seconds))
+        return replace(self, seconds=replace(self.seconds, extract=sizes.default_seconds()))
 
     def of(self, tests: Collection[str]) -> "Prediction":
         """The prediction restricted to some tests; the time remains that of all."""

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from slimsfm.localization.extraction import FIRST_SIZES, second_size, usual_first_size
+from slimsfm.localization.extraction import FIRST_SIZES, first_size, second_size
 from slimsfm.localization.search import ACCURATE
 from slimsfm.pose import PoseEstimate
 
@@ -30,9 +30,6 @@ class FirstSize:
 
     pixels: float
     """Pixels extracted per query on average, and what each round costs besides, in pixels."""
-
-    extract_seconds: float
-    """Predicted mean time of extraction per query."""
 
     error: float
     """Median of the predicted corner error of the poses that end the search."""
@@ -73,7 +70,13 @@ class SizeTrials:
 
     def default(self) -> FirstSize:
         """The size for a map that says nothing."""
-        return self._from(usual_first_size(self._whole))
+        return self._from(first_size(self._whole))
+
+    def default_seconds(self) -> float:
+        """Predicted mean time of extraction per query, with the default size."""
+        rounds = [one for name in self._names for one in self._rounds(name, first_size(self._whole))]
+        times = sum(share * self._tests.extract_seconds(size) for size, share, _ in rounds)
+        return times / len(self._names)
 
     def best(self) -> FirstSize:
         """The size that costs least.
@@ -82,8 +85,9 @@ class SizeTrials:
         those of the whole image, one at least as large need not.
         """
         usual, whole = self.default(), self._from(self._whole)
-        tried = [self._from(size) for size in FIRST_SIZES if size < self._whole]
-        exact = [one for one in tried if one.error <= _AS_EXACT * whole.error]
+        sizes = [size for size in FIRST_SIZES if first_size(self._whole, size) == size < self._whole]
+        tried = [self._from(size) for size in sizes]
+        exact = [one for one in tried if np.isfinite(one.error) and one.error <= _AS_EXACT * whole.error]
         smaller = [one for one in exact if one.size < usual.size]
         larger = [one for one in tried if one.size > usual.size]
         return min([usual, *smaller, *larger, whole], key=lambda one: one.pixels)
@@ -92,12 +96,10 @@ class SizeTrials:
         rounds = [list(self._rounds(name, first)) for name in self._names]
         per_query = len(rounds)
         pixels = sum(share * size**2 + _ROUND for one in rounds for size, share, _ in one)
-        seconds = sum(share * self._tests.extract_seconds(size) for one in rounds for size, share, _ in one)
         errors = [one[-1][2] for one in rounds]
         return FirstSize(
             size=first,
             pixels=pixels / per_query,
-            extract_seconds=seconds / per_query,
             error=float(np.median(errors)),
         )
 

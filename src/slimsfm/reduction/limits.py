@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from math import isfinite
 
 from slimsfm.errors import InputError
 from slimsfm.reduction.choice import DOMINATING, Candidate, Choice, ErrorGrowth, Frontier
@@ -69,7 +70,10 @@ class ReductionLimits:
         )
 
     def __str__(self) -> str:
-        return ", ".join(f"{name} {value:g}" for name, value in self.given.items())
+        said = {name: (name, f"{value:g}") for name, value in self.given.items()}
+        if self.max_relative_error is not None:
+            said["max_relative_error"] = ("max_error", f"{self.max_relative_error:g}d")
+        return ", ".join(" ".join(one) for one in said.values())
 
 
 def recommend(frontier: Frontier, use: str, limits: ReductionLimits = ReductionLimits()) -> Candidate:
@@ -180,10 +184,12 @@ def _with_reserve(smallest: Candidate, fitting: list[Candidate]) -> Candidate:
 
 def _effect(one: Candidate) -> str:
     rough = "" if one.rough_loss is None else f" ({one.rough_loss:.1f} on rough queries)"
+    time = (
+        f", and takes {1e3 * one.seconds:.3g} ms, {1e3 * one.prediction.seconds.extract:.3g} for extraction"
+    )
     return (
         f"loses {one.loss:.1f} points{rough}, has a corner error of {one.prediction.p90_error:.2g}d (90th "
-        f"percentile), {one.growth.p90:.2g} times the full map's, and takes {1e3 * one.seconds:.3g} ms, "
-        f"{1e3 * one.prediction.seconds.extract:.3g} of them for extraction"
+        f"percentile), {one.growth.p90:.2g} times the full map's{time if isfinite(one.seconds) else ''}"
     )
 
 

@@ -13,6 +13,7 @@ from slimsfm.graph import GraphOptions, ReferenceGraph
 from slimsfm.graph.edge_sources import Edges
 from slimsfm.graph.io import read_given_graph
 from slimsfm.localization.point_descriptors import describe_points
+from slimsfm.mapping.info import SMALLEST_FIRST_SIZE
 from slimsfm.mapping.io import weigh_map
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.subset import keep_images, with_points
@@ -347,7 +348,8 @@ def _within(
 def _with_first_image_size(map: Map, forecast: Mapping[str, Candidate]) -> Map:
     """The map, knowing which image to extract the first features of queries from."""
     found = [one.sizes.best().size for one in forecast.values() if one.sizes]
-    return replace(map, info=replace(map.info, first_image_size=max(found, default=None)))
+    large = [size for size in found if size >= SMALLEST_FIRST_SIZE]
+    return replace(map, info=replace(map.info, first_image_size=max(large, default=None)))
 
 
 def _kept(map: Map, forecast: Mapping[str, Candidate]) -> Map:

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from slimsfm.arrays import Descriptors, Ids, Points2D
 from slimsfm.features import match_nearest, unit_rows
 from slimsfm.geometry import motions, reprojection_errors
-from slimsfm.localization.extraction import SMALLEST_SCALE_PX, usual_first_size
+from slimsfm.localization.extraction import SMALLEST_SCALE_PX, first_size
 from slimsfm.localization.point_descriptors import descriptor_sums
 from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import projection_jacobian
@@ -93,9 +93,9 @@ def selection_problem(map: Map, left_out: LeftOut, progress: ProgressBar = silen
         _usable(map, left_out, name, points)
         for name, points in zip(progress(names, "find usable points"), near, strict=True)
     ]
-    if "max_image_size" in map.info.extractor_options:
-        uses += [small for name, one in zip(names, uses, strict=True) if (small := _small(map, name, one))]
-        names *= len(uses) // len(names)
+    small = [_small(map, name, one) for name, one in zip(names, uses, strict=True)]
+    names += [name for name, one in zip(names, small, strict=True) if one]
+    uses += [one for one in small if one]
     columns = np.concatenate([one.points for one in uses])
     starts = np.concatenate([[0], np.cumsum([len(one.points) for one in uses])])
     return SelectionProblem(
@@ -145,13 +145,13 @@ def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> _Uses:
 
 
 def _small(map: Map, name: str, uses: _Uses) -> _Uses | None:
-    """Those that the image can use when it is shrunk; None if its keypoints have no scales."""
-    if uses.scales is None:
+    """Those that the image can use when it is shrunk; None without scales or an image size."""
+    largest = map.info.extractor_options.get("max_image_size")
+    if uses.scales is None or not largest:
         return None
     camera = map.camera(name)
     longer = max(camera.width, camera.height)
-    whole = min(longer, map.info.extractor_options["max_image_size"])
-    factor = longer / min(usual_first_size(whole), whole)
+    factor = longer / first_size(min(longer, largest))
     found = uses.scales >= SMALLEST_SCALE_PX * factor
     return _Uses(uses.points[found], uses.scales[found], factor)
 
