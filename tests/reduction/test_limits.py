@@ -244,7 +244,7 @@ def test_a_largest_error_is_that_of_the_90th_percentile():
         in_units = recommend(found, "direct", ReductionLimits(max_error=limit * DIAGONAL))
         assert in_units is recommend(found, "direct", ReductionLimits(max_relative_error=limit))
         assert in_units is (larger if limit < 0.006 else double)
-    with pytest.raises(InputError, match=r"meets max_relative_error 0\.003; the nearest"):
+    with pytest.raises(InputError, match=r"meets max_error 0\.003d; the nearest"):
         recommend(found, "direct", ReductionLimits(max_relative_error=0.003))
 
 

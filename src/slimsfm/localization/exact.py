@@ -145,6 +145,7 @@ def match_around(
         return PointMatches.none()
     descriptors, points = target[0][inside], target[1][inside]
     count = min(_CANDIDATES, len(query.keypoints))
+    # Scipy takes several k, its types do not
     distances, candidates = KDTree(query.keypoints).query(
         pixels[inside], k=np.arange(1, count + 1), distance_upper_bound=radius_px
     )

@@ -47,6 +47,7 @@ TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 _COARSE_ROUNDS = 4  # of matching, with features of a shrunken image
 _BELIEVED = 0.3  # confidence from which a pose says where to look
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
+_AS_MANY = 0.9  # times the inliers, if they contradict the given one
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
 
 
@@ -210,8 +211,10 @@ class Search:
         unknown = replace(camera, source="unknown")
         again = self._result(last.query, last.matches, unknown, perf_counter(), gravity)
         inliers = [one.pose.num_inliers if one.pose else 0 for one in (last, again)]
-        is_better = inliers[1] > _MORE * inliers[0] and again.confidence > last.confidence
-        return again if is_better else replace(last, match_seconds=0.0, pose_seconds=again.pose_seconds)
+        needed = _MORE if last.evidence is None or last.evidence.misfit < 1 else _AS_MANY
+        if inliers[1] > needed * inliers[0] and again.confidence > last.confidence:
+            return again
+        return replace(last, match_seconds=0.0, pose_seconds=again.pose_seconds)
 
     def near(self, query: Query, camera: QueryCamera, near_cam_from_world: pycolmap.Rigid3d) -> SearchResult:
         """Localize a query of approximately known pose: match points near where they project."""

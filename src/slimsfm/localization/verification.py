@@ -130,11 +130,11 @@ class Evidence:
 
     @property
     def confidence_in_matches(self) -> float:
-        """The confidence, where it is low only because matches like these cannot prove the intrinsics.
+        """The confidence, if twice as many matches proved the intrinsics no better than they mostly do.
 
-        Features of a larger image would hardly change that.
+        Features of a larger image would hardly change more, unless the intrinsics are wrong.
         """
-        provable = min(self.uncalibrated_error, _UNPROVEN)
+        provable = max(min(self.uncalibrated_error, _UNPROVEN), self.uncalibrated_error / 2)
         return replace(self, uncalibrated_error=provable).confidence
 
     @property
