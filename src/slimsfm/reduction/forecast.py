@@ -247,10 +247,9 @@ class Trials:
         factor = max(1.0, max(camera.width, camera.height) / size)
         scales = np.full(len(query.keypoints), np.inf) if query.scales is None else query.scales
         found = np.flatnonzero(scales >= SMALLEST_SCALE_PX * factor)
-        with threadpool_limits(1):
-            matches = unite([match_target(query.descriptors[found], one, self._matching) for one in targets])
-            matched = self._matched(name, replace(matches, keypoints=found[matches.keypoints]), factor)
-            return matched.pose(matched.kept, matched.keypoints.pixels[matched.rows])
+        matches = unite([match_target(query.descriptors[found], one, self._matching) for one in targets])
+        matched = self._matched(name, replace(matches, keypoints=found[matches.keypoints]), factor)
+        return matched.pose(matched.kept, matched.keypoints.pixels[matched.rows])
 
     def _matched(self, name: str, matches: PointMatches, factor: float) -> "_Matched":
         query, camera = self._left_out.query(name), self._map.camera(name)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from slimsfm.localization.extraction import FIRST_SIZES, first_size, second_size
 from slimsfm.localization.search import ACCURATE
@@ -74,7 +75,9 @@ class SizeTrials:
 
     def default_seconds(self) -> float:
         """Predicted mean time of extraction per query, with the default size."""
-        rounds = [one for name in self._names for one in self._rounds(name, first_size(self._whole))]
+        first = first_size(self._whole)
+        with threadpool_limits(1):
+            rounds = [one for name in self._names for one in self._rounds(name, first)]
         times = sum(share * self._tests.extract_seconds(size) for size, share, _ in rounds)
         return times / len(self._names)
 
@@ -93,7 +96,8 @@ class SizeTrials:
         return min([usual, *smaller, *larger, whole], key=lambda one: one.pixels)
 
     def _from(self, first: int) -> FirstSize:
-        rounds = [list(self._rounds(name, first)) for name in self._names]
+        with threadpool_limits(1):  # products on several threads may round differently
+            rounds = [list(self._rounds(name, first)) for name in self._names]
         per_query = len(rounds)
         pixels = sum(share * size**2 + _ROUND for one in rounds for size, share, _ in one)
         errors = [one[-1][2] for one in rounds]
