@@ -1,6 +1,7 @@
 """What commands print in tables: choices of `reduce` and `frontier`, results of `benchmark`."""
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -135,7 +136,7 @@ def print_speed(full: Map, slim: Map, use: str = "") -> None:
     ways = [(speed.exhaustive, "exhaustive")]
     if speed.strategy != "exhaustive":
         ways.append((speed.default, f"{speed.strategy}, the default of localize,"))
-    whole = np.isfinite(speed.slim.extract)
+    whole = isfinite(speed.slim.extract)
     compared = ", ".join(_faster(speed.slim, seconds, way, whole=whole) for seconds, way in ways)
     ours = speed.slim.total if whole else _matching(speed.slim)
     what = f"a whole query{use}, from pixels to pose" if whole else f"matching and pose{use}"
