@@ -145,10 +145,8 @@ def match_around(
         return PointMatches.none()
     descriptors, points = target[0][inside], target[1][inside]
     count = min(_CANDIDATES, len(query.keypoints))
-    # Scipy takes several k, its types do not
-    distances, candidates = KDTree(query.keypoints).query(
-        pixels[inside], k=np.arange(1, count + 1), distance_upper_bound=radius_px
-    )
+    nearest = KDTree(query.keypoints).query(pixels[inside], k=count, distance_upper_bound=radius_px)
+    distances, candidates = (np.reshape(one, (-1, count)) for one in nearest)
     some = np.isfinite(distances[:, 0])
     if not some.any():
         return PointMatches.none()

@@ -214,7 +214,7 @@ class Verifier:
             cells=_cells(matches.pixels(query)[pose.inliers], camera),
             facing=self._facing(points, pose),
             doubted=self._doubted(pose),
-            determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
+            determined=self._determined(pose, predicted_error),
         )
 
     def determined(self, evidence: Evidence, pose: PoseEstimate) -> Evidence:
@@ -228,10 +228,12 @@ class Verifier:
             evidence,
             predicted_error=predicted_error,
             uncalibrated_error=self._uncalibrated_error(pose),
-            determined=1.0 if predicted_error < _DETERMINED else self._determined(pose),
+            determined=self._determined(pose, predicted_error),
         )
 
-    def _determined(self, pose: PoseEstimate) -> float:
+    def _determined(self, pose: PoseEstimate, predicted_error: float) -> float:
+        if predicted_error < _DETERMINED:
+            return 1.0
         return pose.probability_within(ADD_FRACTIONS[0] * inflation(pose.estimated), self._box)
 
     def _facing(self, points: Ids, pose: PoseEstimate) -> float:
