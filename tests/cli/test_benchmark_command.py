@@ -101,7 +101,7 @@ def test_photos_give_their_own_ground_truth(boulder, tmp_path):
     assert [query.path.name for query in result.queries] == list(truth.images)[::4]
     assert not set(full.images) & {query.path.name for query in result.queries}
     assert "n°-n cm: not available" in done.out
-    assert "1 object, 3 queries" in done.out
+    assert f"1 object, {len(result.queries)} queries" in done.out
     assert "1 objects" not in done.out
     assert re.search(r"sift: dominating sets of (1 image|\d+ images);", done.out)
 

@@ -27,7 +27,8 @@ def write_colmap_database(path, map_):
         for name, image in map_.images.items():
             row = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
             database.write_image(row, use_image_id=True)
-            database.write_keypoints(image.image_id, map_.features[name].keypoints)
+            one = map_.features[name]
+            database.write_keypoints(image.image_id, np.hstack([one.keypoints, one.frames]))
             descriptors = pycolmap.FeatureDescriptors(
                 type=pycolmap.FeatureExtractorType.SIFT, data=map_.features[name].descriptors
             )
@@ -190,7 +191,7 @@ def test_hloc_files_give_the_same_poses_and_wrong_matches_are_removed(project, p
         assert map_.features[name].descriptors.dtype == np.float16
         assert map_.features[name].keypoints == pytest.approx(original.features[name].keypoints, abs=1e-4)
     found, true = poses_of_queries(map_), poses_of_queries(original)
-    assert found == pytest.approx(true, abs=5e-3)
+    assert found == pytest.approx(true, abs=2e-2)  # these features have no scales
     kept = wrong = lost = 0
     for pair, pairs in original.matches.items():
         right = set(map(tuple, pairs.tolist()))

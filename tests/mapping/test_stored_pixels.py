@@ -160,7 +160,7 @@ def test_a_query_is_read_as_its_map_says(plain, stored, query):
         assert found.pose is not None
         assert first.pose is not None
         expected = turned_pose(first.pose.cam_from_world, turns)
-        assert rotation_error_deg(found.pose.cam_from_world, expected) < 0.3
+        assert rotation_error_deg(found.pose.cam_from_world, expected) < 0.6  # from an image of 128 pixels
 
 
 def test_one_query_is_read_both_ways_for_maps_of_both_kinds(plain, stored, query):

@@ -17,6 +17,7 @@ from slimsfm.pose.ransac import (
     search_upright,
 )
 from slimsfm.pose.refinement import refine_pose
+from slimsfm.pose.scatter import refine_to_scatter
 from slimsfm.pose.types import PoseEstimate, pose_covariance
 
 _MIN_INLIERS = 4  # of a hypothesis at a focal length that may be wrong
@@ -34,8 +35,8 @@ def estimate_pose(
 ) -> PoseEstimate | None:
     """Estimate the pose of a camera from 2D-3D matches.
 
-    P3P inside LO-RANSAC [1], then a robust refinement over the inliers. The lens distortion of any COLMAP
-    camera model is removed first, so one solver serves all models.
+    P3P inside LO-RANSAC [1], then a refinement whose loss adapts to the scatter of the inliers. The lens
+    distortion of any COLMAP camera model is removed first, so one solver serves all models.
 
     With an unknown focal length, P3P searches at several focal lengths [2], and pose and focal length are
     refined together from the hypothesis with the most inliers. At a focal length that is wrong by a fifth, a
@@ -77,7 +78,7 @@ def estimate_pose(
     elif gravity is not None:
         start = _upright(points2D, points3D_in_world, camera, options, gravity)
     else:
-        return _by_p3p(points2D, points3D_in_world, camera, options)
+        return _by_p3p(points2D, points3D_in_world, camera, options, is_final=True)
     if start is None:
         return None
     found = refine_pose(
@@ -101,12 +102,20 @@ class _Hypothesis:
 
 
 def _by_p3p(
-    points2D: Points2D, points3D_in_world: Points3D, camera: pycolmap.Camera, options: RansacOptions
+    points2D: Points2D,
+    points3D_in_world: Points3D,
+    camera: pycolmap.Camera,
+    options: RansacOptions,
+    *,
+    is_final: bool = False,
 ) -> PoseEstimate | None:
     matches = PinholeMatches.of(points2D, points3D_in_world, camera)
     if len(matches.rows) < options.min_inliers:
         return None
     cam_from_world, found = search_p3p(matches, options)
+    if is_final:
+        cam_from_world = refine_to_scatter(matches, cam_from_world, options.max_error_px)
+        found = np.flatnonzero(matches.errors(cam_from_world) <= options.max_error_px)
     if len(found) < options.min_inliers:
         return None
     inliers = np.zeros(len(points2D), dtype=bool)

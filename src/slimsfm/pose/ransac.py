@@ -68,6 +68,15 @@ class PinholeMatches:
         """Focal length in pixels."""
         return self.pinhole["params"][0]
 
+    def errors(self, cam_from_world: pycolmap.Rigid3d) -> Float64[np.ndarray, " n"]:
+        """Reprojection errors in pixels; infinite behind the camera."""
+        x, y, z = (cam_from_world * self.in_world).T
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            scale = self.focal_px / z
+            errors = np.hypot(scale * x - self.pixels[:, 0], scale * y - self.pixels[:, 1])
+        errors[~(z > 0)] = np.inf
+        return errors
+
 
 def to_poselib(cam_from_world: pycolmap.Rigid3d) -> poselib.CameraPose:
     """Convert a pose to PoseLib, whose quaternions begin with w."""

@@ -11,15 +11,13 @@ from slimsfm.arrays import Mask, Points2D, Points3D
 from slimsfm.geometry import motions, project, reprojection_errors
 from slimsfm.pose.priors import FOCAL, UNKNOWNS, FocalPrior, FramePrior, Gravity, Prior, with_focal_length
 from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
+from slimsfm.pose.scatter import CAUCHY, EXACT_PX, MINIMAL, median_sigma, refine_to_scatter
 from slimsfm.pose.types import MIN_SIGMA_PX, PoseEstimate, pose_covariance
 
 _ROUNDS = 8  # of choosing inliers; 2 to 4 are common
 _STEPS = 30  # of Levenberg-Marquardt per round; 5 are common
 _NEGLIGIBLE = 1e-6  # decrease of the cost that ends a round: a thousandth of a sigma
 _FARTHEST = 0.5  # change of an intrinsic per step
-CAUCHY = 2.385  # scale of the loss in sigmas: 95 % efficiency if the errors were normal
-_EXACT_SIGMA_PX = 1e-3  # of exact matches; at zero the priors would weigh nothing
-_MINIMAL = 4  # matches that a pose and a focal length need
 _STEP = 1e-6  # of the numerical derivative of the lens, relative to depth
 
 
@@ -95,18 +93,18 @@ def _refine_by_matches(
     max_error_px: float,
 ) -> PoseEstimate:
     matches = PinholeMatches.of(points2D, points3D_in_world, camera)
-    found, _ = poselib.refine_absolute_pose(
+    found, _ = poselib.refine_absolute_pose(  # of all matches: the start may be far off
         matches.pixels,
         matches.in_world,
         to_poselib(start_cam_from_world),
         matches.pinhole,
         {"loss_type": "CAUCHY", "loss_scale": max_error_px / 3},
     )
-    cam_from_world = from_poselib(found)
+    cam_from_world = refine_to_scatter(matches, from_poselib(found), max_error_px)
     inliers = reprojection_errors(points2D, points3D_in_world, cam_from_world, camera) <= max_error_px
     agree = inliers[matches.rows]
     covariance = None
-    if agree.sum() >= _MINIMAL:
+    if agree.sum() >= MINIMAL:
         covariance = pose_covariance(
             matches.pixels[agree], matches.in_world[agree], cam_from_world, matches.focal_px
         )
@@ -118,11 +116,11 @@ def _refine_in_rounds(problem: "_Problem", fit: "_Fit", max_error_px: float) -> 
     errors = fit.errors(problem.pixels, problem.in_world)
     for last in range(_ROUNDS):
         inliers = errors < max_error_px
-        if inliers.sum() < _MINIMAL:
+        if inliers.sum() < MINIMAL:
             return PoseEstimate(cam_from_world=fit.cam_from_world, inliers=inliers, camera=fit.camera)
         fit = _minimize(problem.of(inliers), fit)
         errors = fit.errors(problem.pixels, problem.in_world)
-        sigma_px = float(np.clip(_scatter_px(errors[inliers]), _EXACT_SIGMA_PX, max_error_px / 3))
+        sigma_px = float(np.clip(_scatter_px(errors[inliers]), EXACT_PX, max_error_px / 3))
         problem = replace(problem, sigma_px=sigma_px)
         if last and np.array_equal(inliers, errors < max_error_px):
             break
@@ -251,11 +249,6 @@ def _scatter_px(errors: Float64[np.ndarray, " n"]) -> float:
     """Sigma of each coordinate from the median error, corrected for the seven unknowns that were fitted."""
     degrees = 2 * len(errors)
     return float(median_sigma(errors) * np.sqrt(degrees / max(degrees - 7, 1)))
-
-
-def median_sigma(errors: Float64[np.ndarray, " n"]) -> float:
-    """Standard deviation of each coordinate of normal errors in the plane, from their median length."""
-    return float(np.median(errors) / np.sqrt(2 * np.log(2)))
 
 
 def _solve(

@@ -8,12 +8,10 @@ from jaxtyping import Float64
 from slimsfm.arrays import Points2D, Points3D
 from slimsfm.geometry import reprojection_errors
 from slimsfm.pose.ransac import PinholeMatches, from_poselib, to_poselib
-from slimsfm.pose.refinement import CAUCHY, median_sigma
+from slimsfm.pose.scatter import CAUCHY, EXACT_PX, MINIMAL, median_sigma
 from slimsfm.pose.types import PoseEstimate, pose_covariance
 
-_EXACT_PX = 1e-3  # smallest scatter: a loss needs a scale where matches are exact
 _CLASSES = 4  # per factor of two between spreads: within a class they differ by 9 % from its own
-_MINIMAL = 4  # matches of a covariance
 
 
 def refine_weighted(
@@ -47,14 +45,14 @@ def refine_weighted(
     errors = reprojection_errors(points2D, points3D_in_world, start_cam_from_world, camera)
     near = errors[matches.rows] <= max_error_px
     found = start_cam_from_world
-    if near.sum() >= _MINIMAL:
+    if near.sum() >= MINIMAL:
         used = matches.rows[near]
-        scatter = np.clip(median_sigma(errors[used] / spreads[used]), _EXACT_PX, max_error_px / 3)
+        scatter = np.clip(median_sigma(errors[used] / spreads[used]), EXACT_PX, max_error_px / 3)
         found = _minimized(matches, near, scatter * spreads[matches.rows], start_cam_from_world)
     inliers = reprojection_errors(points2D, points3D_in_world, found, camera) <= max_error_px
     agree = inliers[matches.rows]
     covariance = None
-    if agree.sum() >= _MINIMAL and found is not start_cam_from_world:
+    if agree.sum() >= MINIMAL and found is not start_cam_from_world:
         covariance = pose_covariance(
             matches.pixels[agree],
             matches.in_world[agree],
