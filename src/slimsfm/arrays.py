@@ -23,3 +23,8 @@ Ids = Int64[np.ndarray, " n"]
 
 IndexPairs = Int64[np.ndarray, "n 2"]
 """Row (i, j) matches item i of the first set with item j of the second."""
+
+
+def evenly_spaced(count: int, most: int) -> Ids:
+    """At most `most` of `count` rows, ascending and evenly spaced, with the first and the last one."""
+    return np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64)

@@ -15,7 +15,7 @@ from scenes import BOX, camera, poses
 from slimsfm.features import Features, unit_rows
 from slimsfm.geometry import corner_error, project
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
-from slimsfm.localization.localizer import load_strategy
+from slimsfm.localization.options import load_strategy
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Strategy, unite
 from slimsfm.mapping.map import Map

@@ -9,7 +9,7 @@ from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
-from slimsfm.localization.search import RoundResult, suffices
+from slimsfm.localization.round_result import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.strategy import PointMatches, Query
 from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence

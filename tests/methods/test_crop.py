@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from scenes import BOX, camera, poses
+from slimsfm.arrays import evenly_spaced
 from slimsfm.geometry import project
 from slimsfm.methods.onepose.crop import (
+    LOOKED_AT,
     FoundPoints,
     Region,
     RegionVote,
     box_region,
     crop_region,
-    evenly_spaced,
     locate_object,
     region_by_matches,
 )
@@ -156,7 +157,7 @@ def test_a_later_look_takes_precedence():
 
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 400])
 def test_images_to_match_are_evenly_spaced(count):
-    rows = evenly_spaced(count)
+    rows = evenly_spaced(count, LOOKED_AT)
     assert len(rows) == min(count, 15)
     assert set(rows) <= set(range(count))
     gaps = [b - a for a, b in pairwise(rows)]

@@ -10,7 +10,7 @@ from slimsfm.errors import InputError
 from slimsfm.features import NearestOptions
 from slimsfm.features.registry import plugins
 from slimsfm.localization import STRATEGIES, LocalizationOptions, Localizer
-from slimsfm.localization.localizer import supports
+from slimsfm.localization.options import supports
 from slimsfm.localization.point_descriptors import describe_points
 from slimsfm.localization.strategies import Direct
 from slimsfm.mapping.hloc import write_hloc

@@ -24,7 +24,7 @@ from slimsfm.graph import GraphOptions
 from slimsfm.graph.compute import load_or_compute_graph
 from slimsfm.graph.edge_sources import Edges
 from slimsfm.localization import LocalizationOptions
-from slimsfm.localization.localizer import supports
+from slimsfm.localization.options import supports
 from slimsfm.localization.rounds import ExtractionChoice
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.io import bytes_by_part, read_map, write_map

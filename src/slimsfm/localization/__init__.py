@@ -2,7 +2,8 @@
 
 from slimsfm.localization.batch import MultiLocalizer, localize_images, localize_objects
 from slimsfm.localization.fallback import check_same_frame, localize_failed
-from slimsfm.localization.localizer import STRATEGIES, LocalizationOptions, Localizer
+from slimsfm.localization.localizer import Localizer
+from slimsfm.localization.options import STRATEGIES, LocalizationOptions
 from slimsfm.localization.outcome import Localization, Seconds
 
 __all__ = [

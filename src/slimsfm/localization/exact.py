@@ -16,7 +16,7 @@ import pycolmap
 from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import KDTree
 
-from slimsfm.arrays import Ids, Points2D
+from slimsfm.arrays import Ids, Points2D, evenly_spaced
 from slimsfm.features import NearestOptions
 from slimsfm.geometry import project
 from slimsfm.localization.point_descriptors import PointSizes
@@ -107,7 +107,7 @@ class ExactPass:
         else:
             descriptors, points = self._strategy.visible_points(cam_from_world, agreeing)
         shown = np.flatnonzero(self._sizes.show(points, cam_from_world, camera))
-        shown = shown[np.linspace(0, len(shown) - 1, min(_MOST_POINTS, len(shown))).astype(np.int64)]
+        shown = shown[evenly_spaced(len(shown), _MOST_POINTS)]
         return descriptors[shown], points[shown]
 
 

@@ -1,9 +1,7 @@
 """Localize a query image against one map."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from time import perf_counter
-from typing import get_args
 
 import numpy as np
 import pycolmap
@@ -11,114 +9,26 @@ import pycolmap
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.errors import MapError
 from slimsfm.features import Features, shrink_factor, unit_rows
-from slimsfm.features.registry import importing, load_object, plugins
 from slimsfm.localization.cameras import (
-    FocalLength,
     QueryCamera,
     camera_in_memory,
 )
 from slimsfm.localization.extraction import Extracted, SizedExtractor
 from slimsfm.localization.matching import extract_near
+from slimsfm.localization.options import LocalizationOptions, load_strategy
 from slimsfm.localization.outcome import Localization, Seconds
+from slimsfm.localization.round_result import RoundResult, SearchResult
 from slimsfm.localization.rounds import (
-    ExtractionChoice,
     FeatureSource,
     ImageRounds,
     given_features,
     levels_of,
 )
-from slimsfm.localization.search import RoundResult, Search, SearchResult
-from slimsfm.localization.strategy import MatchingOptions, PoseGuided, Query, Strategy
+from slimsfm.localization.search import Search
+from slimsfm.localization.strategy import PoseGuided, Query
 from slimsfm.mapping.descriptors import descriptor_length
 from slimsfm.mapping.map import Map
-from slimsfm.pose import Gravity, RansacOptions
-
-# Paths, not classes: naming a strategy must not import its dependencies.
-STRATEGIES = {
-    "direct": "slimsfm.localization.strategies:Direct",
-    "exhaustive": "slimsfm.localization.strategies:Exhaustive",
-    "onepose": "slimsfm.methods.onepose.strategy:OnePoseStrategy",
-    "onepose++": "slimsfm.methods.onepose_plus.strategy:OnePosePlusStrategy",
-    "progressive": "slimsfm.localization.strategies:Progressive",
-    "retrieval": "slimsfm.localization.strategies:Retrieval",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocalizationOptions:
-    """How queries are localized."""
-
-    strategy: str = "auto"
-    """What to match against: every reference image (exhaustive), the images most similar to the query
-    (retrieval), one image after another until the pose is sure (progressive), or the points, by their
-    descriptors (direct) or by a network (onepose, onepose++). auto: direct if the map has points chosen for
-    it, exhaustive if it was built without a detector, else progressive."""
-
-    matching: MatchingOptions = MatchingOptions()
-    """How the strategy matches."""
-
-    ransac: RansacOptions = RansacOptions()
-    """How the pose is estimated."""
-
-    focal: FocalLength = "auto"
-    """How far the focal length of the queries is believed. auto: as its source says, and it is estimated
-    together with the pose where it is not known or where the matches contradict it. known: as it is, without
-    correction. approximate: to 30 %. unknown: not at all."""
-
-    extraction: ExtractionChoice = "rounds"
-    """Image that features of a query are extracted from: a small version of it first, and larger ones only
-    until the pose is sure, which all points near it make exact (rounds), or the whole image, without that
-    second pass, as in version 0.1 (whole)."""
-
-    min_confidence: float = 0.5
-    """Poses of lower confidence are discarded: the query counts as not localized."""
-
-    def __post_init__(self) -> None:
-        known = sorted({**STRATEGIES, **plugins("strategy")})
-        if self.strategy not in ("auto", *known):
-            raise ValueError(f"strategy must be auto or one of {', '.join(known)}, got {self.strategy!r}")
-        if self.extraction not in get_args(ExtractionChoice):
-            raise ValueError(
-                f"extraction must be one of {', '.join(get_args(ExtractionChoice))}, got {self.extraction!r}"
-            )
-        if not 0 <= self.min_confidence <= 1:
-            raise ValueError(f"min_confidence must be between 0 and 1, got {self.min_confidence}")
-
-    def strategy_for(self, map: Map) -> str:
-        """Name of the strategy to use with a map."""
-        if self.strategy != "auto":
-            return self.strategy
-        if not map.has_keypoints:
-            return "exhaustive"
-        return "progressive" if map.point_descriptors is None else "direct"
-
-
-def load_strategy(name: str, map: Map, options: MatchingOptions = MatchingOptions()) -> Strategy:
-    """Create the strategy of this name for a map.
-
-    Raises:
-        InputError: A package or weights that the strategy needs are missing.
-        MapError: The strategy cannot work with this kind of map.
-    """
-    with importing(f"strategy {name!r}"):
-        return _strategy_class(name)(map, options)
-
-
-def supports(strategy: str, map: Map) -> bool:
-    """Whether a map has what the strategy of this name requires.
-
-    Raises:
-        InputError: A package that the strategy needs is missing.
-    """
-    if strategy == "auto":
-        return True
-    with importing(f"strategy {strategy!r}"):
-        requires = getattr(_strategy_class(strategy), "requires", "features")
-    return map.has_keypoints if requires == "points" else not map.is_for_direct_matching
-
-
-def _strategy_class(name: str) -> Callable[[Map, MatchingOptions], Strategy]:
-    return load_object({**plugins("strategy"), **STRATEGIES}[name])
+from slimsfm.pose import Gravity
 
 
 class Localizer:

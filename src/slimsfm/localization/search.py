@@ -1,45 +1,38 @@
 """Match a query in rounds until its pose is sure and accurate, or nothing is left to try."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from time import perf_counter
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from slimsfm.geometry import project, resized_camera
+from slimsfm.geometry import project
 from slimsfm.localization.cameras import CameraSource, FocalLength, QueryCamera
 from slimsfm.localization.exact import ExactPass
 from slimsfm.localization.extraction import Extracted, Window
 from slimsfm.localization.matching import match_near
 from slimsfm.localization.point_descriptors import PointSizes, distinct_points
+from slimsfm.localization.round_result import (
+    SURE,
+    RoundResult,
+    SearchResult,
+    needs_refuting,
+    suffices,
+    summed,
+)
 from slimsfm.localization.rounds import Levels, Seen
+from slimsfm.localization.shrunk import Shrunk
 from slimsfm.localization.sight import Sight
 from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy
-from slimsfm.localization.verification import Evidence, Verifier, inflation
+from slimsfm.localization.verification import Verifier, inflation
 from slimsfm.mapping.map import Map
 from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
 
-SURE = 0.95
-"""Confidence from which a pose is sure."""
-
 CONVINCING = 0.5
 """Confidence from which a pose is made exact: matches near a wrong pose are worth nothing."""
-
-MIN_REFUTING = 2
-"""Number of images that could have contradicted an ambiguous pose, before the search may stop."""
-
-ACCURATE = 0.007
-"""Predicted relative corner error up to which a pose is accurate."""
-
-SPREAD = 10
-"""Number of squares of the image in which inliers of an accurate pose must lie."""
-
-SETTLED = 0.8
-"""Share of the previous round's predicted error above which further matches no longer help much."""
 
 TRUSTED: tuple[CameraSource, ...] = ("given", "map", "queries")
 """Sources of intrinsics that are taken as known as long as no matches contradict them."""
@@ -49,55 +42,6 @@ _BELIEVED = 0.3  # confidence from which a pose says where to look
 _MORE = 1.3  # times the inliers that a pose with another focal length must have
 _AS_MANY = 0.9  # times the inliers, if they contradict the given one
 _APPROXIMATE = 0.3  # largest relative error of an approximate focal length
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RoundResult:
-    """Result of one round."""
-
-    query: Query
-    """The features that were matched."""
-
-    matches: PointMatches
-    """All matches of these features so far."""
-
-    pose: PoseEstimate | None
-    """The pose estimated from them, with its confidence."""
-
-    camera: pycolmap.Camera
-    """The intrinsics, with the estimated focal length if it was not known."""
-
-    evidence: Evidence | None
-    """What the confidence is computed from; None if there is no pose."""
-
-    match_seconds: float
-    """Wall time of matching in this round."""
-
-    pose_seconds: float
-    """Wall time of estimating and verifying the pose."""
-
-    @property
-    def confidence(self) -> float:
-        """Confidence of the pose; below zero if there is none."""
-        return -1.0 if self.pose is None else self.pose.confidence or 0.0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SearchResult:
-    """The round that counts, and what all rounds took."""
-
-    best: RoundResult
-    """The last round with a pose: it has all matches of the rounds before with the same features, and any
-    that contradict them."""
-
-    references: int
-    """Number of reference images that the query was matched with."""
-
-    match_seconds: float
-    """Wall time of matching."""
-
-    pose_seconds: float
-    """Wall time of estimating and verifying poses."""
 
 
 class Search:
@@ -155,7 +99,7 @@ class Search:
         """The same pose, more exact: see `ExactPass`."""
         if best.pose is None or best.evidence is None:
             return best
-        shrunk = _Shrunk.of(best.query, best.matches, best.camera)
+        shrunk = Shrunk.of(best.query, best.matches, best.camera)
         found = self._exact.refined(
             shrunk.query, shrunk.matches, best.pose, shrunk.camera, self._ransac.max_error_px
         )
@@ -180,19 +124,19 @@ class Search:
             for one in islice(matching, _COARSE_ROUNDS if is_coarse else None):
                 rounds.append(one)
                 if suffices(rounds, is_coarse=is_coarse) and not needs_refuting(one):
-                    return _summed(rounds)
+                    return summed(rounds)
             if level.is_last:
                 break
             if suffices(rounds, is_coarse=True):  # a larger image has no more references
-                return _summed(rounds)
+                return summed(rounds)
             try:
                 level = levels.send(self._seen(rounds[-1]))
             except StopIteration:
-                return _summed(rounds)
+                return summed(rounds)
         is_sure = rounds and rounds[-1].confidence >= SURE
         if rounds and not is_sure and self._focal == "auto" and camera.source in TRUSTED:
             rounds.append(self._with_any_focal_length(rounds[-1], camera, gravity))
-        return _summed(rounds)
+        return summed(rounds)
 
     def _seen(self, last: RoundResult) -> Seen:
         """Where the map's points are in the image, as far as the pose is believed."""
@@ -226,7 +170,7 @@ class Search:
             points3D = self._map.points3D_in_world[target[1]]
             pixels = project(points3D, near_cam_from_world, camera.camera)
             matches = match_near(query, target, pixels, camera.camera, self._map.descriptor_metric)
-        return _summed([self._result(query, matches, camera, start)])
+        return summed([self._result(query, matches, camera, start)])
 
     def rounds(
         self, query: Query, camera: QueryCamera, gravity: Gravity | None = None
@@ -252,7 +196,7 @@ class Search:
         gravity: Gravity | None = None,
     ) -> RoundResult:
         matched = perf_counter()
-        shrunk = _Shrunk.of(query, matches, camera.camera)
+        shrunk = Shrunk.of(query, matches, camera.camera)
         pose = self._estimate(shrunk, camera.source, gravity)
         estimated, evidence = camera.camera, None
         if pose is not None:
@@ -271,9 +215,7 @@ class Search:
             pose_seconds=perf_counter() - matched,
         )
 
-    def _estimate(
-        self, shrunk: "_Shrunk", source: CameraSource, gravity: Gravity | None
-    ) -> PoseEstimate | None:
+    def _estimate(self, shrunk: Shrunk, source: CameraSource, gravity: Gravity | None) -> PoseEstimate | None:
         """The pose, with the intrinsics as far as they are believed; those that do not fit are estimated.
 
         None if there is none that the map allows: every result is decided on here.
@@ -305,66 +247,3 @@ class Search:
         return (
             FocalPrior.of(camera, _APPROXIMATE) if self._focal == "approximate" else FocalPrior.near(camera)
         )
-
-
-class _Shrunk(NamedTuple):
-    """Matches in pixels in which keypoints were found, because that is what limits in pixels are for."""
-
-    query: Query
-    matches: PointMatches
-    camera: pycolmap.Camera
-    whole: pycolmap.Camera
-    factor: float
-
-    @classmethod
-    def of(cls, query: Query, matches: PointMatches, camera: pycolmap.Camera) -> "_Shrunk":
-        factor = min(query.shrink_factor, max(matches.shrink_factor, 1.0))
-        if factor == 1:
-            return cls(query, matches, camera, camera, factor)
-        if matches.points2D is not None:
-            matches = replace(matches, points2D=matches.points2D / factor)
-        small = resized_camera(camera, 1 / factor)
-        return cls(
-            replace(query, keypoints=query.keypoints / factor, camera=small), matches, small, camera, factor
-        )
-
-    def enlarged(self, estimated: pycolmap.Camera) -> pycolmap.Camera:
-        """The intrinsics of the image, from those that were estimated for the shrunk one."""
-        if self.factor == 1:
-            return estimated
-        enlarged = resized_camera(estimated, self.factor)
-        enlarged.width, enlarged.height = self.whole.width, self.whole.height
-        return enlarged
-
-
-def suffices(rounds: list[RoundResult], *, is_coarse: bool = False) -> bool:
-    """Whether the last pose is sure, and not improving much, or accurate by inliers all over the object.
-
-    Inliers in one corner may agree with each other more exactly than with the rest, as repeated texture does.
-
-    Args:
-        rounds: The rounds so far.
-        is_coarse: Whether features of a larger image are the alternative.
-    """
-    last = rounds[-1].evidence
-    if last is None or (last.confidence_in_matches if is_coarse else last.confidence) < SURE:
-        return False
-    is_same_image = len(rounds) > 1 and rounds[-2].query is rounds[-1].query
-    before = rounds[-2].evidence if is_same_image else None
-    settled = before is not None and last.predicted_error > SETTLED * before.predicted_error
-    return settled or (last.predicted_error <= ACCURATE and last.cells >= SPREAD)
-
-
-def needs_refuting(last: RoundResult) -> bool:
-    """Whether a pose is ambiguous and more images could contradict it."""
-    is_ambiguous = last.evidence is not None and last.evidence.is_ambiguous
-    return is_ambiguous and last.matches.references < MIN_REFUTING
-
-
-def _summed(rounds: list[RoundResult]) -> SearchResult:
-    return SearchResult(
-        best=next((one for one in reversed(rounds) if one.pose), rounds[-1]),
-        references=max(one.matches.references for one in rounds),
-        match_seconds=sum(one.match_seconds for one in rounds),
-        pose_seconds=sum(one.pose_seconds for one in rounds),
-    )

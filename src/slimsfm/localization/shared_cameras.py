@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from slimsfm.arrays import evenly_spaced
 from slimsfm.localization.cameras import QueryCamera
 from slimsfm.localization.outcome import Localization
 from slimsfm.localization.search import TRUSTED
@@ -40,8 +41,8 @@ def share_cameras(cameras: Mapping[str, QueryCamera], localize: Localize) -> dic
     shared = dict(cameras)
     for names in _groups(cameras):
         if cameras[names[0]].source in ("exif", "unknown"):
-            places = np.linspace(0, len(names) - 1, min(_SAMPLED, len(names))).round().astype(int)
-            focal_px = _agreed_focal_length(localize([names[place] for place in places]))
+            sampled = [names[place] for place in evenly_spaced(len(names), _SAMPLED)]
+            focal_px = _agreed_focal_length(localize(sampled))
             shared.update(_with_focal_length(cameras, names, focal_px))
     return shared
 

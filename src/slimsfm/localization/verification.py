@@ -34,7 +34,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
-from slimsfm.arrays import Descriptors, Ids, Mask, Points2D
+from slimsfm.arrays import Descriptors, Ids, Mask, Points2D, evenly_spaced
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
 from slimsfm.localization.point_descriptors import PointSizes, viewing_directions
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
@@ -278,7 +278,7 @@ class Verifier:
         visible = np.flatnonzero(inside & self._sizes.show(points, pose.cam_from_world, camera))
         if not len(visible):
             return 0.0
-        visible = visible[np.linspace(0, len(visible) - 1, min(_CHECKED, len(visible))).astype(int)]
+        visible = visible[evenly_spaced(len(visible), _CHECKED)]
         return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
 
 

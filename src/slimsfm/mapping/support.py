@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slimsfm.arrays import Points2D
+from slimsfm.arrays import Points2D, evenly_spaced
 from slimsfm.mapping.model import camera_of, positions
 from slimsfm.mapping.pairs import Matches, in_order
 from slimsfm.mapping.parallax import centered, share_without_parallax
@@ -226,6 +226,5 @@ def _focal_lengths(images: Mapping[str, pycolmap.Image]) -> dict[str, float]:
     cameras = {name: camera_of(images[name]) for name in first.values()}
     found = {name: c.mean_focal_length() / max(c.width, c.height) for name, c in cameras.items()}
     by_length = sorted(found, key=lambda name: (found[name], name))
-    places = np.linspace(0, len(found) - 1, min(len(found), _LISTED_CAMERAS)).round().astype(int)
-    listed = {by_length[place] for place in places.tolist()}
+    listed = {by_length[place] for place in evenly_spaced(len(found), _LISTED_CAMERAS)}
     return {name: found[name] for name in sorted(listed)}

@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
-from slimsfm.arrays import Ids, Mask, Points2D, Points3D
+from slimsfm.arrays import Ids, Mask, Points2D, Points3D, evenly_spaced
 from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
 from slimsfm.localization import Seconds
 from slimsfm.localization.extraction import SMALLEST_SCALE_PX, Window
@@ -138,8 +138,7 @@ class Trials:
         self._clock = clock
         names = list(map.images)
         most = _MOST_TESTS if map.has_keypoints else 0  # a query has no descriptors
-        places = np.linspace(0, len(names) - 1, min(most, len(names))).round().astype(int)
-        self.tests = tuple(names[place] for place in places)
+        self.tests = tuple(names[place] for place in evenly_spaced(len(names), most))
         sees = observed(map).astype(np.int32)
         self._common = csr_array(sees @ sees.T)
         self._finest_error = float(np.median([_half_pixel(map, name) for name in self.tests] or [0.0]))

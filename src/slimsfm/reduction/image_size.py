@@ -12,8 +12,9 @@ from functools import cache
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from slimsfm.arrays import evenly_spaced
 from slimsfm.localization.extraction import FIRST_SIZES, first_size, second_size
-from slimsfm.localization.search import ACCURATE
+from slimsfm.localization.round_result import ACCURATE
 from slimsfm.pose import PoseEstimate
 
 _MOST_TESTS = 30
@@ -64,9 +65,8 @@ class SizeTrials:
 
     def __init__(self, tests: SizedTests) -> None:
         """Set the references; 30 of them are used if there are more."""
-        places = np.linspace(0, len(tests.names) - 1, min(_MOST_TESTS, len(tests.names)))
         self._tests, self._whole = tests, tests.whole
-        self._names = [tests.names[int(place)] for place in places.round()]
+        self._names = [tests.names[place] for place in evenly_spaced(len(tests.names), _MOST_TESTS).tolist()]
         self._outcome = cache(self._localized)
 
     def default(self) -> FirstSize:

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from slimsfm.arrays import evenly_spaced
 from slimsfm.localization import LocalizationOptions, Localizer, Seconds
 from slimsfm.localization.cameras import QueryCamera
 from slimsfm.localization.rounds import StoredRounds
@@ -55,7 +56,7 @@ def measure_speed(map: Map, slim: Map) -> Speed | None:
     count = min(_MOST_TESTS, len(names), max(1, int(_SHARE_TESTED * len(map.images))))
     if not count or len(map.images) < 2:
         return None
-    tests = [names[place] for place in np.linspace(0, len(names) - 1, count).round().astype(int)]
+    tests = [names[place] for place in evenly_spaced(len(names), count)]
     full = keep_images(map, [name for name in map.images if name not in tests])
     default = LocalizationOptions()
     ways = (

@@ -28,7 +28,9 @@ _LEAST_PX = 16.0  # longer side of a region; smaller ones show too little
 _LEAST_MATCHES = 6
 _NEAR_PX, _NEAR = 6.0, 6 / 1920  # largest error of an inlier: in pixels, and relative to the longer side
 _FINEST = 8  # samples per pixel of a crop and axis: enough for photos of 4096 pixels
-_REFERENCES = 15  # reference images that are matched to locate the object, as in OnePose
+LOOKED_AT = 15
+"""Reference images that are matched to locate the object, as in OnePose."""
+
 _SURE = 60  # inliers with which no further image is matched
 
 
@@ -216,11 +218,6 @@ def locate_object(votes: Iterable[RegionVote | None]) -> LocatedObject:
     found = [one for one in seen if one is not None]
     best = max(found, key=lambda one: one.inliers).region if found else None
     return LocatedObject(best, len(seen))
-
-
-def evenly_spaced(count: int) -> list[int]:
-    """At most 15 of `count` rows, evenly spaced."""
-    return np.linspace(0, count - 1, min(_REFERENCES, count)).round().astype(int).tolist()
 
 
 def _around(corners: Points2D, image_size: tuple[int, int]) -> Region | None:

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from slimsfm.arrays import Descriptors, Ids, Points2D
+from slimsfm.arrays import Descriptors, Ids, Points2D, evenly_spaced
 from slimsfm.errors import MapError
 from slimsfm.features import Extractor, unit_rows
 from slimsfm.localization.matching import matching_with
@@ -27,13 +27,13 @@ from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map, check_has_features
 from slimsfm.methods.onepose.crop import (
     CROP_PX,
+    LOOKED_AT,
     FoundPoints,
     LocatedObject,
     Region,
     RegionVote,
     box_region,
     crop_region,
-    evenly_spaced,
     locate_object,
     region_by_matches,
 )
@@ -169,7 +169,7 @@ class ObjectFinder:
             InputError: The matcher is unknown or does not support the map's features.
         """
         self._matching = matching_with(map, options)
-        self._views = [views[i] for i in evenly_spaced(len(views))]
+        self._views = [views[i] for i in evenly_spaced(len(views), LOOKED_AT)]
 
     def find(self, query: Query) -> LocatedObject:
         """Locate the object where the most matches with one reference image agree."""

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from slimsfm.arrays import Image
+from slimsfm.arrays import Image, evenly_spaced
 from slimsfm.errors import MapError
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target
 from slimsfm.mapping.map import Map, check_has_features
@@ -27,13 +27,13 @@ from slimsfm.methods.loftr.cells import EncodedImage, ImageMatcher
 from slimsfm.methods.loftr.matcher import Loftr
 from slimsfm.methods.onepose.crop import (
     CROP_PX,
+    LOOKED_AT,
     FoundPoints,
     LocatedObject,
     Region,
     RegionVote,
     box_region,
     crop_region,
-    evenly_spaced,
     locate_object,
     region_by_matches,
 )
@@ -150,7 +150,7 @@ class PhotoObjectFinder:
         seen = {name: _region_in_photo(map, name) for name in map.images if name in map.photos}
         regions = {name: region for name, region in seen.items() if region is not None}
         names = sorted(regions)
-        self._regions = {names[row]: regions[names[row]] for row in evenly_spaced(len(names))}
+        self._regions = {names[row]: regions[names[row]] for row in evenly_spaced(len(names), LOOKED_AT)}
         self._photos: Mapping[str, Image] = map.photos
         self._matcher = matcher
         self._encoded: dict[str, EncodedImage] = {}
