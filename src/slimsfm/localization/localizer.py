@@ -45,10 +45,18 @@ class Localizer:
         self.options = options
         self._extractor = SizedExtractor(map)
         self.extractor = self._extractor.whole
-        self._strategy = load_strategy(options.strategy_for(map), map, options.matching)
+        strategy = options.strategy_for(map)
+        self._strategy = load_strategy(strategy, map, options.matching)
         self._length = descriptor_length(map)
         is_exact = options.extraction == "rounds"
-        self._search = Search(map, self._strategy, options.ransac, options.focal, is_exact=is_exact)
+        self._search = Search(
+            map,
+            self._strategy,
+            options.ransac,
+            options.focal,
+            is_exact=is_exact,
+            matches_much=strategy == "exhaustive",
+        )
 
     def localize(
         self,

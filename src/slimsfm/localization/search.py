@@ -1,6 +1,7 @@
 """Match a query in rounds until its pose is sure and accurate, or nothing is left to try."""
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 from time import perf_counter
@@ -30,6 +31,7 @@ from slimsfm.localization.verification import Verifier, inflation
 from slimsfm.mapping.map import Map
 from slimsfm.pose import FocalPrior, Gravity, PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import FOCAL_LENGTH, fit_camera, with_check
+from slimsfm.threads import one_blas_thread
 
 CONVINCING = 0.5
 """Confidence from which a pose is made exact: matches near a wrong pose are worth nothing."""
@@ -55,6 +57,7 @@ class Search:
         focal: FocalLength = "auto",
         *,
         is_exact: bool = True,
+        matches_much: bool = False,
     ) -> None:
         """Prepare for a map; the other arguments are those of `LocalizationOptions`.
 
@@ -64,6 +67,7 @@ class Search:
             ransac: How poses are estimated.
             focal: How far focal lengths are believed.
             is_exact: Whether sure poses are refined by the exact pass.
+            matches_much: Whether the strategy matches so much that it gains from several threads.
         """
         self._map = map
         self._strategy = strategy
@@ -73,6 +77,7 @@ class Search:
         self._verifier = Verifier(map, strategy, distinct_points(map), sizes)
         self._sight = Sight(map)
         self._exact, self._is_exact = ExactPass(map, strategy, sizes), is_exact
+        self._threads = nullcontext if matches_much else one_blas_thread
 
     def run(
         self,
@@ -89,7 +94,11 @@ class Search:
             camera: The intrinsics.
             gravity: Direction of gravity.
         """
-        found, start = self._searched(levels, prepare, camera, gravity), perf_counter()
+        with self._threads():
+            return self._exact_result(self._searched(levels, prepare, camera, gravity), gravity)
+
+    def _exact_result(self, found: SearchResult, gravity: Gravity | None) -> SearchResult:
+        start = perf_counter()
         if not self._is_exact or found.best.confidence < CONVINCING or gravity is not None:
             return found
         best = self._refined(found.best)
@@ -163,14 +172,18 @@ class Search:
     def near(self, query: Query, camera: QueryCamera, near_cam_from_world: pycolmap.Rigid3d) -> SearchResult:
         """Localize a query of approximately known pose: match points near where they project."""
         start = perf_counter()
+        with self._threads():
+            matches = self._near(query, camera.camera, near_cam_from_world)
+            return summed([self._result(query, matches, camera, start)])
+
+    def _near(
+        self, query: Query, camera: pycolmap.Camera, near_cam_from_world: pycolmap.Rigid3d
+    ) -> PointMatches:
         if isinstance(self._strategy, PoseGuided):
-            matches = self._strategy.near(query, near_cam_from_world)
-        else:
-            target = self._strategy.visible_points(near_cam_from_world)
-            points3D = self._map.points3D_in_world[target[1]]
-            pixels = project(points3D, near_cam_from_world, camera.camera)
-            matches = match_near(query, target, pixels, camera.camera, self._map.descriptor_metric)
-        return summed([self._result(query, matches, camera, start)])
+            return self._strategy.near(query, near_cam_from_world)
+        target = self._strategy.visible_points(near_cam_from_world)
+        pixels = project(self._map.points3D_in_world[target[1]], near_cam_from_world, camera)
+        return match_near(query, target, pixels, camera, self._map.descriptor_metric)
 
     def rounds(
         self, query: Query, camera: QueryCamera, gravity: Gravity | None = None

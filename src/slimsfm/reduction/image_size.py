@@ -5,7 +5,7 @@ scale is still large enough after shrinking, so a map without photos can tell ho
 an image of each size would localize, and how exactly.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -44,7 +44,7 @@ class SizedTests:
     whole: int
     """Longer side of the image from which features are extracted at once."""
 
-    names: Sequence[str]
+    names: tuple[str, ...]
     """The references."""
 
     localize: Callable[[str, int], PoseEstimate | None]
@@ -66,7 +66,7 @@ class SizeTrials:
     def __init__(self, tests: SizedTests) -> None:
         """Set the references; 30 of them are used if there are more."""
         self._tests, self._whole = tests, tests.whole
-        self._names = [tests.names[place] for place in evenly_spaced(len(tests.names), _MOST_TESTS).tolist()]
+        self._names = [tests.names[place] for place in evenly_spaced(len(tests.names), _MOST_TESTS)]
         self._outcome = cache(self._localized)
 
     def default(self) -> FirstSize:
