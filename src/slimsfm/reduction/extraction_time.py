@@ -33,7 +33,8 @@ def extraction_seconds(map: Map, longer_side: int | None = None) -> float:
 
     Args:
         map: The map, with features.
-        longer_side: Shrink the image to this longer side before; None: an image as large as the map's.
+        longer_side: Shrink the image to this longer side, which counts too; None: an image as large as the
+            map's.
 
     Raises:
         MapError: The options of the extractor in the map are impossible.
@@ -62,11 +63,15 @@ class _Measured:
 
     def seconds(self, longer_side: int | None) -> float:
         if longer_side not in self._seconds:
-            image = self._image if longer_side is None else shrink(self._image, longer_side)
-            self._extractor.extract(image)  # the first run also pays for what is only done once
-            times = [_seconds(self._extractor, image) for _ in range(_RUNS)]
+            self._measure(longer_side)  # the first run also pays for what is only done once
+            times = [self._measure(longer_side) for _ in range(_RUNS)]
             self._seconds[longer_side] = float(np.median(times))
         return self._seconds[longer_side]
+
+    def _measure(self, longer_side: int | None) -> float:
+        start = perf_counter()
+        self._extractor.extract(self._image if longer_side is None else shrink(self._image, longer_side))
+        return perf_counter() - start
 
 
 _MEASURED: WeakKeyDictionary[Map, _Measured] = WeakKeyDictionary()
@@ -111,9 +116,3 @@ def _noise(width: int, height: int) -> Float32[np.ndarray, "h w"]:
 def _image(noise: Float32[np.ndarray, "h w"], contrast: float) -> Image:
     gray = np.clip(_GRAY + contrast * noise, 0, 255).astype(np.uint8)
     return np.repeat(gray[:, :, None], 3, axis=2)
-
-
-def _seconds(extractor: Extractor, image: Image) -> float:
-    start = perf_counter()
-    extractor.extract(image)
-    return perf_counter() - start
