@@ -11,7 +11,7 @@ from slimsfm.domination import exact, random_greedy
 from slimsfm.evaluation import scores
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions
-from slimsfm.localization import LocalizationOptions, search, verification
+from slimsfm.localization import LocalizationOptions, round_result, verification
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import DominatingSetOptions, forecast
 from slimsfm.selection import information, problem
@@ -35,9 +35,9 @@ def test_the_weights_of_the_confidence_match_the_code():
         (r"\tau = {:g}", GraphOptions().threshold),
         (r"\tau = {:g}", DominatingSetOptions().threshold),
         ("probability that $e < {:g}$", ADD_FRACTIONS[0]),
-        (r"c_t \ge {:g}", search.SURE),
-        (r"\hat{{e}}_t \le {:g}", search.ACCURATE),
-        (r"\hat{{e}}_t > {:g} \hat", search.SETTLED),
+        (r"c_t \ge {:g}", round_result.SURE),
+        (r"\hat{{e}}_t \le {:g}", round_result.ACCURATE),
+        (r"\hat{{e}}_t > {:g} \hat", round_result.SETTLED),
         ("$c < {:g}$ is discarded", LocalizationOptions().min_confidence),
         ("inliers within {:g} px", RansacOptions().max_error_px),
         (r"\sigma_0 = {:g}", problem.PRIOR_SIGMA),
@@ -53,7 +53,7 @@ def test_a_number_matches_the_code(words, value):
 def test_numbers_in_words_match_the_code():
     assert verification.UNAMBIGUOUS == 0.75  # three quarters of the inliers
     assert verification.RIVAL_RANSAC.min_inliers == 6
-    assert search.MIN_REFUTING == 2
+    assert round_result.MIN_REFUTING == 2
     assert RansacOptions().min_inliers == 12
     assert default(exact, "time_limit_s") == 60  # a minute
     choosing = sys.modules[information.__module__]
