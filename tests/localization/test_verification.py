@@ -8,6 +8,7 @@ from scenes import camera, exact_map, poses
 from slimsfm.features import Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.localization.cameras import QueryCamera
 from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
 from slimsfm.localization.round_result import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
@@ -51,6 +52,26 @@ def test_confidence_never_rises_as_evidence_gets_worse(name):
 def test_there_is_a_weight_per_term_and_none_is_negative():
     assert EVIDENCE_WEIGHTS.shape == GOOD.terms.shape
     assert np.all(EVIDENCE_WEIGHTS[1:] >= 0)
+
+
+def test_given_intrinsics_need_no_proof_unless_matches_contradict_them():
+    given = replace(GOOD, calibrated=True)
+    assert given.confidence == GOOD.confidence
+    unproven = [replace(one, uncalibrated_error=0.5).confidence for one in (given, GOOD)]
+    assert unproven[0] > 0.9
+    assert unproven[0] > unproven[1] + 0.05
+    contradicted = [replace(one, uncalibrated_error=0.5, misfit=1.0).confidence for one in (given, GOOD)]
+    assert contradicted[0] == contradicted[1]
+
+
+@pytest.mark.parametrize("source", ["given", "map", "exif"])
+def test_only_intrinsics_that_come_with_the_query_count_as_given(exact, source):
+    query = QueryCamera(camera=camera(), source=source)
+    (*_, last) = Localizer(exact, LocalizationOptions(strategy="exhaustive")).rounds(
+        exact.features[next(iter(exact.images))], query
+    )
+    assert last.evidence is not None
+    assert last.evidence.calibrated == (source == "given")
 
 
 def found_with(evidence_of, query, lens, strategy="exhaustive"):

@@ -214,7 +214,9 @@ class Search:
         estimated, evidence = camera.camera, None
         if pose is not None:
             used = pose.camera or shrunk.camera
-            evidence = self._verifier.evidence(shrunk.query, shrunk.matches, pose, used)
+            evidence = self._verifier.evidence(
+                shrunk.query, shrunk.matches, pose, used, calibrated=camera.source == "given"
+            )
             if pose.camera is not None:
                 estimated = shrunk.enlarged(pose.camera)
             pose = replace(pose, confidence=evidence.confidence, camera=pose.camera and estimated)

@@ -11,8 +11,8 @@ uses quantities that are rarely good for a wrong pose:
                 this one
     found       share of the points that should be visible that have a similar keypoint where they project,
                 and no equally similar one elsewhere
-    intrinsics  the corner error that a wrong camera could cause without being noticed, and how much the
-                matches contradict the camera
+    intrinsics  the corner error that a wrong camera could cause without being noticed, unless the camera was
+                given with the query, and how much the matches contradict the camera
     spread      number of squares of the image with inliers
 
 Their weighted sum is the log-odds that the pose is right. The weights come from logistic regression on
@@ -118,6 +118,9 @@ class Evidence:
     determined: float = 1.0
     """Probability that the corner error is below 0.1, if the inliers are right."""
 
+    calibrated: bool = False
+    """Whether the intrinsics were given with the query, not taken from the map or the photo's EXIF data."""
+
     @property
     def confidence(self) -> float:
         """Probability that the pose is right."""
@@ -136,6 +139,13 @@ class Evidence:
         """
         provable = max(min(self.uncalibrated_error, _UNPROVEN), self.uncalibrated_error / 2)
         return replace(self, uncalibrated_error=provable).confidence
+
+    @property
+    def _unproven_error(self) -> float:
+        """The error by wrong intrinsics that counts: given ones need no proof unless contradicted."""
+        if self.calibrated and self.misfit < 1:
+            return min(self.uncalibrated_error, _UNPROVEN)
+        return self.uncalibrated_error
 
     @property
     def is_behind(self) -> bool:
@@ -160,7 +170,7 @@ class Evidence:
                 -min(self.rival / self.inliers, 1.0),
                 self.found,
                 -np.log(np.clip(self.predicted_error, 0.04, 1.0) / 0.04),
-                -np.log(np.clip(self.uncalibrated_error, 0.02, 1.0) / 0.1),
+                -np.log(np.clip(self._unproven_error, 0.02, 1.0) / 0.1),
                 -min(self.misfit, 1.0),
                 np.log(np.clip(self.cells, 1, 30) / 10),
             ]
@@ -190,7 +200,13 @@ class Verifier:
         self._centers = np.array([image.projection_center() for image in map.images.values()])
 
     def evidence(
-        self, query: Query, matches: PointMatches, pose: PoseEstimate, camera: pycolmap.Camera
+        self,
+        query: Query,
+        matches: PointMatches,
+        pose: PoseEstimate,
+        camera: pycolmap.Camera,
+        *,
+        calibrated: bool = False,
     ) -> Evidence:
         """Collect the evidence for a pose.
 
@@ -199,6 +215,7 @@ class Verifier:
             matches: The matches that the pose was estimated from.
             pose: The pose.
             camera: The query's intrinsics.
+            calibrated: Whether they were given with the query.
         """
         agreeing, points = matches.keypoints[pose.inliers], matches.points[pose.inliers]
         others, predicted_error = ~pose.inliers, pose.predicted_corner_error(self._box)
@@ -215,6 +232,7 @@ class Verifier:
             facing=self._facing(points, pose),
             doubted=self._doubted(pose),
             determined=self._determined(pose, predicted_error),
+            calibrated=calibrated,
         )
 
     def determined(self, evidence: Evidence, pose: PoseEstimate) -> Evidence:

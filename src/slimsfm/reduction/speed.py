@@ -81,7 +81,7 @@ def measure_speed(map: Map, slim: Map) -> Speed | None:
 
 def _seconds(ways: tuple[Localizer, ...], map: Map, name: str) -> list[tuple[float, float, float]]:
     """Time of each stage of an image with each localizer."""
-    camera, times = QueryCamera(camera=map.camera(name), source="given"), []
+    camera, times = QueryCamera(camera=map.camera(name), source="map"), []
     for one in ways:
         source = StoredRounds(map.features[name], partial(extraction_if_known, map))
         found = one.localize_in_rounds(source, camera).seconds
