@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("kornia")
 pytest.importorskip("transformers")
 
+from transformers.models.superglue.modeling_superglue import log_optimal_transport  # noqa: E402
 
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.features import (  # noqa: E402
@@ -22,11 +23,12 @@ from slimsfm.features import (  # noqa: E402
     Matcher,
     load_extractor,
     load_matcher,
+    match_many,
     match_nearest,
     unit_rows,
 )
 from slimsfm.features.registry import descriptor_metric_of  # noqa: E402
-from slimsfm.methods.superglue import superglue_state  # noqa: E402
+from slimsfm.methods.superglue import SuperGlue, _transport, superglue_state  # noqa: E402
 from slimsfm.methods.superpoint import superpoint_state  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402
 
@@ -140,7 +142,7 @@ MATCHERS = [
 @pytest.mark.parametrize(
     ("method", "features", "dimensions"), MATCHERS, ids=["-".join(m[:2]) for m in MATCHERS]
 )
-def test_every_matcher_keeps_the_contract(method, features, dimensions):
+def test_every_matcher_keeps_the_contract(method, features, dimensions, monkeypatch):
     rng = np.random.default_rng(0)
     one, other = described(rng, 60, dimensions), described(rng, 45, dimensions, (320, 240))
     matcher = load_matcher(method, features)
@@ -153,6 +155,65 @@ def test_every_matcher_keeps_the_contract(method, features, dimensions):
     assert len(set(pairs[:, 1])) == len(pairs)
     empty = one[np.zeros(0, np.int64)]
     assert matcher.match(empty, other).shape == matcher.match(other, empty).shape == (0, 2)
+    many = [(one, other), (empty, other), (other, one), (one, one[np.arange(7)]), (other, empty)]
+    for memory in (0, 10**9):  # keypoint pairs: on a CPU, and on a GPU, where they come in one batch
+        monkeypatch.setattr("slimsfm.networks.batches.keypoint_pairs_of", lambda _, memory=memory: memory)
+        found = match_many(matcher, many)
+        assert len(found) == len(many)
+        assert all(map(np.array_equal, found, [matcher.match(*pair) for pair in many]))
+    assert match_many(matcher, []) == []
+
+
+@pytest.fixture
+def sharp():
+    """SuperGlue with seeded weights that compares little but descriptors, and so matches similar ones."""
+    matcher = SuperGlue("superpoint")
+    with torch.no_grad():
+        matcher.network.final_projection.final_proj.weight.copy_(16 * torch.eye(256))
+    return matcher
+
+
+@pytest.mark.usefixtures("untrained")
+def test_superglue_scores_and_matches_in_a_batch_are_those_of_each_pair(sharp, monkeypatch):
+    rng = np.random.default_rng(2)
+    one = described(rng, 60, 256)
+    pairs = []
+    for count, others, size in (
+        (40, 0, (640, 480)),
+        (10, 70, (320, 240)),
+        (1, 0, (640, 480)),
+        (0, 30, (480, 640)),
+    ):
+        new = described(rng, count + others, 256, size)
+        same = one.descriptors[rng.permutation(60)[:count]].astype(np.float32)
+        noisy = unit_rows(same + 0.02 * rng.normal(size=same.shape))
+        pairs.append((one, replace(new, descriptors=np.concatenate([noisy, new.descriptors[count:]]))))
+    with torch.inference_mode():
+        together = sharp.scores(pairs, torch.device("cpu"))
+        for row, pair in enumerate(pairs):
+            alone = sharp.scores([pair], torch.device("cpu"))[0]
+            rows, columns = ([*range(len(features)), -1] for features in pair)
+            assert torch.allclose(together[row][rows][:, columns], alone, atol=1e-4)
+            assert (together[row][:-1, len(pair[1]) : -1] == -torch.inf).all()
+    monkeypatch.setattr("slimsfm.networks.batches.keypoint_pairs_of", lambda _: 10**9)
+    found = sharp.match_many(pairs)
+    assert all(map(np.array_equal, found, [sharp.match(*pair) for pair in pairs]))
+    assert [len(matches) > count / 2 for matches, count in zip(found, (40, 10, 1), strict=False)] == [
+        True
+    ] * 3
+
+
+def test_superglue_transports_as_the_library_does():
+    generator = torch.Generator().manual_seed(0)
+    products, bin_score = 3 * torch.randn(2, 30, 20, generator=generator), torch.tensor(1.5)
+    everything = torch.ones(2, 30, dtype=torch.bool), torch.ones(2, 20, dtype=torch.bool)
+    expected = log_optimal_transport(products, bin_score, 100)
+    assert torch.allclose(_transport(products, bin_score, *everything), expected, atol=1e-5)
+    some = everything[0], torch.arange(20).expand(2, -1) < 12
+    found = _transport(products, bin_score, *some)
+    expected = log_optimal_transport(products[:, :, :12], bin_score, 100)
+    assert torch.allclose(found[:, :, [*range(12), -1]], expected, atol=1e-5)
+    assert (found[:, :, 12:-1] == -torch.inf).all()
 
 
 def test_nearest_uses_the_metric_of_the_features():
