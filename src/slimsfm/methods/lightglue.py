@@ -33,13 +33,13 @@ class LightGlue:
         """Create a matcher for the features of an extractor, one of `KNOWN`."""
         if features not in KNOWN:
             raise ValueError(f"features must be of one of {', '.join(KNOWN)}, got {features!r}")
-        self._features = features
+        self._features, self._weights = features, f"lightglue-{features}"
 
     @cached_property
     def network(self) -> Network:
         """The network with its trained weights."""
-        made, weights = network_for(self._features), f"lightglue-{self._features}"
-        loaded = load_network(made, weights, lightglue_state, derived={"confidence_thresholds"})
+        made, derived = network_for(self._features), {"confidence_thresholds"}
+        loaded = load_network(made, self._weights, lightglue_state, derived)
         for layer in loaded.transformers:
             layer.cross_attn = CrossAttention(layer.cross_attn)  # pyright: ignore[reportArgumentType]
         return loaded
@@ -52,7 +52,7 @@ class LightGlue:
         if not len(features1) or not len(features2):
             return np.zeros((0, 2), np.int64)
         device = choose_device()
-        run = onnx_run(f"lightglue-{self._features}")
+        run = onnx_run(self._weights)
         given1, given2 = self._input(features1, device), self._input(features2, device)
         with torch.inference_mode(), inference(device):
             if run:
@@ -129,7 +129,11 @@ class _WithoutStops(nn.Module):
 
 def exportable(method: str) -> Exportable:
     """The whole network: from the keypoints of two images to the match of each of the first, or -1."""
-    network = LightGlue(method.removeprefix("lightglue-")).network.cpu()
+    return exportable_network(LightGlue(method.removeprefix("lightglue-")).network.cpu())
+
+
+def exportable_network(network: Network) -> Exportable:
+    """The whole of a network with weights, on the CPU."""
     given = [_example(network, count) for count in (24, 32)]
     inputs = {f"{name}{i + 1}": value for i, one in enumerate(given) for name, value in one.items()}
     return Exportable(
@@ -158,9 +162,15 @@ def network_for(features: str) -> Network:
 
 
 def lightglue_state(checkpoint: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert the authors' state dict, which numbers layers per kind, to that of kornia."""
+    """Convert the authors' state dict, which numbers layers per kind, to that of kornia.
+
+    The file of LighterGlue also holds XFeat.
+    """
     state = {}
     for key, value in checkpoint.items():
+        if key.startswith("extractor."):
+            continue
+        key = key.removeprefix("matcher.")
         for kind in ("self_attn", "cross_attn"):
             if key.startswith(f"{kind}."):
                 _, layer, rest = key.split(".", 2)
