@@ -129,7 +129,7 @@ def find_weights(name: str) -> FoundWeights | None:
     path = folder / weights.file if folder else None
     if path is not None and path.is_file():
         check_weights(path, weights)
-        return FoundWeights(path, f"in {folder}")
+        return FoundWeights(path, "weights folder")
     return _from_package(weights.package) if weights.package else None
 
 

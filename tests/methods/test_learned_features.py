@@ -15,6 +15,7 @@ pytest.importorskip("kornia")
 pytest.importorskip("transformers")
 
 
+from networks.seeded_xfeat import accept_seeded_xfeat, write_seeded_xfeat  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.features import (  # noqa: E402
     Extractor,
@@ -31,19 +32,20 @@ from slimsfm.methods.superpoint import superpoint_state  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
-RANDOM = ["disk", "superpoint"]
+RANDOM = ["disk", "superpoint", "xfeat"]
 STEP = 32  # shift of pictures in pixels, a multiple of every network's grid
 
 
 @pytest.fixture(scope="session")
 def random_weights(tmp_path_factory):
     writer = run_path(str(Path(__file__).parents[2] / "benchmarks" / "random_weights.py"))
-    return writer["write_random_weights"](tmp_path_factory.mktemp("weights"))
+    return write_seeded_xfeat(writer["write_random_weights"](tmp_path_factory.mktemp("weights")))
 
 
 @pytest.fixture
 def weights(request, monkeypatch, random_weights):
     """The weights folder for the extractor under test."""
+    accept_seeded_xfeat(monkeypatch)
     folder = SHARED if request.getfixturevalue("name") == "aliked" else random_weights
     if not folder.is_dir():
         pytest.skip("needs the trained ALIKED weights in ../shared/weights, which are not here")
@@ -52,6 +54,7 @@ def weights(request, monkeypatch, random_weights):
 
 @pytest.fixture
 def untrained(monkeypatch, random_weights):
+    accept_seeded_xfeat(monkeypatch)
     monkeypatch.setenv(FOLDER, str(random_weights))
 
 
@@ -84,9 +87,9 @@ class TestExtractors:
     def test_shifting_the_picture_shifts_keypoints(self, name, textured):
         """Exactly for SuperPoint; with ALIKED and DISK the border has a weak influence everywhere."""
         extractor = load_extractor(name, {"max_features": 4000})
-        picture = np.zeros((240 + STEP, 320 + STEP, 3), np.uint8)
+        picture = np.zeros((256 + STEP, 320 + STEP, 3), np.uint8)  # XFeat shrinks to multiples of 32
         here, there = picture.copy(), picture.copy()
-        here[:240, :320], there[STEP:, STEP:] = textured, textured
+        here[:240, :320], there[STEP : STEP + 240, STEP:] = textured, textured
         one, other = (inner(extractor.extract(p), shift) for p, shift in ((here, 0), (there, STEP)))
         distances, rows = KDTree(other).query(one)
         near = distances < 1
@@ -132,7 +135,9 @@ MATCHERS = [
     ("lightglue", "aliked", 128),
     ("lightglue", "disk", 128),
     ("lightglue", "sift", 128),
+    ("lighterglue", "xfeat", 64),
     ("nearest", "aliked", 128),
+    ("nearest", "xfeat", 64),
 ]
 
 
@@ -168,7 +173,11 @@ def test_nearest_uses_the_metric_of_the_features():
 
 @pytest.mark.parametrize(
     ("method", "features", "known"),
-    [("superglue", "aliked", "superpoint"), ("lightglue", "orb", "aliked, disk, sift, superpoint")],
+    [
+        ("superglue", "aliked", "superpoint"),
+        ("lightglue", "orb", "aliked, disk, sift, superpoint"),
+        ("lighterglue", "aliked", "xfeat"),
+    ],
 )
 def test_features_that_a_matcher_does_not_know_are_named(method, features, known):
     with pytest.raises(
@@ -186,7 +195,7 @@ def test_sift_features_olderer_maps_lack_what_lightglue_needs():
 
 def test_an_unknown_matcher_is_named():
     with pytest.raises(
-        InputError, match="matcher 'guess' is unknown; known are lightglue, nearest, superglue"
+        InputError, match="matcher 'guess' is unknown; known are lighterglue, lightglue, nearest, superglue"
     ):
         load_matcher("guess", "sift")
 

@@ -17,6 +17,8 @@ References:
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib import import_module
+from types import ModuleType
 from typing import NamedTuple
 
 import cv2
@@ -68,6 +70,8 @@ class XFeat:
         check_sizes(self.max_features, self.max_image_size)
         if not 0 < self.threshold < 1:
             raise ValueError(f"threshold must be between 0 and 1, got {self.threshold}")
+        if onnx_network("xfeat") is None:  # what is missing is said before any work
+            _pytorch()
 
     @property
     def name(self) -> str:
@@ -82,9 +86,7 @@ class XFeat:
     @cached_property
     def network(self) -> ArrayRun:
         """The network in PyTorch."""
-        with importing("extractor 'xfeat' without xfeat.onnx in the weights folder"):
-            from slimsfm.methods.xfeat_network import load_maps
-        return load_maps()
+        return _pytorch().load_maps()
 
     def extract(self, image: Image, mask: GrayImage | None = None) -> Features:
         """Extract features; the mask has the size of the image, and no feature lies where it is 0."""
@@ -103,7 +105,12 @@ class XFeat:
         )
 
 
-def _network_input(image: Image) -> Float32[np.ndarray, "height width"]:
+def _pytorch() -> ModuleType:
+    with importing("extractor 'xfeat'"):
+        return import_module("slimsfm.methods.xfeat_network")
+
+
+def _network_input(image: Image) -> Float32[np.ndarray, "h w"]:
     """Gray values from 0 to 1, the mean of the colors, interpolated to sides that are multiples of 32."""
     gray = cv2.transform(image.astype(np.float32), np.full((1, 3), 1 / (3 * 255)))
     height, width = (max(_STEP, side // _STEP * _STEP) for side in image.shape[:2])

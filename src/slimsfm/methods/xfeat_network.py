@@ -25,7 +25,8 @@ class XFeatMaps(nn.Module):
         for block in network.modules():
             if isinstance(block, BasicLayer):
                 convolution, norm, relu = block.layer
-                block.layer = nn.Sequential(fuse_conv_bn_eval(convolution, norm), relu)
+                fused = fuse_conv_bn_eval(convolution, norm)  # pyright: ignore[reportArgumentType]
+                block.layer = nn.Sequential(fused, relu)
         self.network = network
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 

@@ -47,7 +47,7 @@ def onnx_network(method: str) -> ArrayRun | None:
 def _runs_on_cpu() -> bool:
     """Whether networks run on the CPU; PyTorch is asked only where it decides."""
     device = current_runtime().device
-    if device == "cpu" or (device == "auto" and "torch" not in sys.modules and find_spec("torch") is None):
+    if device == "cpu" or (device == "auto" and find_spec("torch") is None):
         return True
     from slimsfm.networks.loading import choose_device
 
