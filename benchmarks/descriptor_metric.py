@@ -4,8 +4,8 @@
 
 In each folder of photos, some pairs of photos two names apart are matched: mutual nearest descriptors without
 any threshold. Matches that fit the epipolar geometry of the pair count as right. Printed are the shares of
-right and of wrong matches below thresholds, of the angle between the descriptors and of its ratio to the angle
-of the second nearest.
+right and of wrong matches below thresholds of two values: the angle between the descriptors, and its ratio to
+the angle to the second nearest.
 """
 
 import argparse

@@ -60,7 +60,7 @@ EXTRACTORS = {
     ),
     "xfeat": ExtractorEntry(
         path="slimsfm.methods.xfeat:XFeat",
-        descriptor_metric=NearestOptions(max_ratio=0.95, max_distance=0.7),
+        descriptor_metric=NearestOptions(max_ratio=0.98, max_distance=0.7),
         descriptor_length=64,
         signed=True,
     ),
