@@ -1,5 +1,6 @@
 """XFeat and LighterGlue against the authors' code, PyTorch's sampling and ONNX; see golden/README.md."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,9 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("kornia")
@@ -25,8 +28,13 @@ from networks.seeded_xfeat import (  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.features import Features, load_extractor, load_matcher, unit_rows  # noqa: E402
 from slimsfm.features.registry import export_method  # noqa: E402
+from slimsfm.geometry import corner_error  # noqa: E402
+from slimsfm.mapping.build import BuildOptions, KnownPoses, build_map  # noqa: E402
+from slimsfm.mapping.io import write_map  # noqa: E402
 from slimsfm.methods.lighterglue import LighterGlue  # noqa: E402
 from slimsfm.methods.xfeat import CellMaps, describe_keypoints, find_keypoints, score_keypoints  # noqa: E402
+from slimsfm.synthetic.objects import OBJECTS  # noqa: E402
+from slimsfm.synthetic.scene import mapping_take, object_box  # noqa: E402
 from slimsfm.weights import FOLDER, Runtime, use_runtime  # noqa: E402
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
@@ -219,6 +227,8 @@ import sys
 
 for package in ("torch", "kornia", "transformers"):
     sys.modules[package] = None
+"""
+EXTRACT = """
 import numpy as np
 from slimsfm.errors import InputError
 from slimsfm.features import load_extractor
@@ -230,25 +240,66 @@ except InputError as error:
     sys.exit(str(error))
 np.savez(out, keypoints=found.keypoints, descriptors=found.descriptors, scores=found.scores)
 """
+COMMAND = """
+from slimsfm.cli import run
+sys.exit(run(sys.argv[1:]))
+"""
+
+
+def without_torch(code: str, *arguments: object, weights: Path) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-c", WITHOUT_TORCH + code, *map(str, arguments)]
+    environment = {**os.environ, FOLDER: str(weights), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
 
 
 def test_onnx_needs_no_pytorch(seeded, tmp_path):
     image = picture("second")
-    np.save(tmp_path / "image.npy", image)
-    command = [sys.executable, "-c", WITHOUT_TORCH, tmp_path / "image.npy", tmp_path / "out.npz"]
-    environment = {**os.environ, FOLDER: str(seeded), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    paths = tmp_path / "image.npy", tmp_path / "out.npz"
+    np.save(paths[0], image)
+    done = without_torch(EXTRACT, *paths, weights=seeded)
     assert done.returncode == 1
     assert done.stderr.strip() == (
         "extractor 'xfeat' needs torch, which is not installed: pip install 'slimsfm[learned]'"
     )
     export(seeded, "xfeat")
     (seeded / "xfeat.pt").unlink()
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    done = without_torch(EXTRACT, *paths, weights=seeded)
     assert done.returncode == 0, done.stderr
-    found, here = np.load(tmp_path / "out.npz"), load_extractor("xfeat").extract(image)
+    found, here = np.load(paths[1]), load_extractor("xfeat").extract(image)
     for name in ("keypoints", "descriptors", "scores"):
         assert np.array_equal(found[name], getattr(here, name))
+
+
+@needs_trained
+@pytest.mark.parametrize("extraction", ["rounds", "whole"])
+def test_onnx_localizes_without_pytorch(extraction, tmp_path):
+    """From the frames of a video around an object but one, whose pose is found."""
+    take, left_out = mapping_take("printed_box", 80, 320, 240, 0), 4
+    photos, onnx, out = tmp_path / "photos", tmp_path / "onnx", tmp_path / "poses.json"
+    photos.mkdir()
+    onnx.mkdir()
+    frames = {f"{i}.png": i for i in range(8) if i != left_out}
+    for name, i in frames.items():
+        Image.fromarray(take.frame(i)).save(photos / name)
+    Image.fromarray(take.frame(left_out)).save(tmp_path / "query.png")
+    take.camera.camera_id = 1
+    box = object_box(OBJECTS["printed_box"](0))
+    known = KnownPoses(
+        cameras=dict.fromkeys(frames, take.camera),
+        cam_from_world={name: take.cam_from_object[i] for name, i in frames.items()},
+        box=box,
+        unit="metre",
+    )
+    with use_runtime(Runtime(weights=SHARED, device="cpu")):
+        write_map(build_map(photos, BuildOptions(extractor="xfeat"), known=known), tmp_path / "map")
+        export(onnx, "xfeat")
+    given = "localize", tmp_path / "map", tmp_path / "query.png", "-o", out, "--extraction", extraction
+    done = without_torch(COMMAND, *given, weights=onnx)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(out.read_text())["images"]
+    pose = row["cam_from_world"]
+    found = pycolmap.Rigid3d(pycolmap.Rotation3d(pose["quaternion_xyzw"]), pose["translation"])
+    assert corner_error(found, take.cam_from_object[left_out], box) < 0.02
 
 
 @needs_trained
