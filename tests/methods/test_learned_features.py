@@ -27,6 +27,7 @@ from slimsfm.features import (  # noqa: E402
     unit_rows,
 )
 from slimsfm.features.registry import descriptor_metric_of  # noqa: E402
+from slimsfm.methods.lightglue import lightglue_state  # noqa: E402
 from slimsfm.methods.superglue import superglue_state  # noqa: E402
 from slimsfm.methods.superpoint import superpoint_state  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402
@@ -209,6 +210,19 @@ def test_the_authors_names_of_values_are_those_of_the_library(random_weights):
     assert shapes == {key: value.shape for key, value in own.items()}
     library = torch.load(random_weights / "superpoint_v1.pth", weights_only=True)
     assert superpoint_state(library).keys() == library.keys()
+
+
+def test_values_of_published_files_that_lightglue_does_not_use_are_left_out():
+    """The file of LighterGlue holds XFeat, and that for DISK a value `r` per layer."""
+    names = {
+        "matcher.transformers.0.self_attn.Wqkv.bias": "transformers.0.self_attn.Wqkv.bias",
+        "cross_attn.8.to_v.bias": "transformers.8.cross_attn.to_v.bias",
+        "log_assignment.0.matchability.bias": "log_assignment.0.matchability.bias",
+        "log_assignment.0.r": None,
+        "extractor.model.net.skip1.1.bias": None,
+    }
+    state = lightglue_state({name: torch.zeros(1) for name in names})
+    assert list(state) == [name for name in names.values() if name]
 
 
 def superglue_of_the_authors() -> dict:

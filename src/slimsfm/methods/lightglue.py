@@ -164,11 +164,11 @@ def network_for(features: str) -> Network:
 def lightglue_state(checkpoint: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Convert the authors' state dict, which numbers layers per kind, to that of kornia.
 
-    The file of LighterGlue also holds XFeat.
+    The file of LighterGlue also holds XFeat, and that for DISK values `r` that the network has no use for.
     """
     state = {}
     for key, value in checkpoint.items():
-        if key.startswith("extractor."):
+        if key.startswith("extractor.") or (key.startswith("log_assignment.") and key.endswith(".r")):
             continue
         key = key.removeprefix("matcher.")
         for kind in ("self_attn", "cross_attn"):
