@@ -16,6 +16,7 @@ pytest.importorskip("transformers")
 
 from transformers.models.superglue.modeling_superglue import log_optimal_transport  # noqa: E402
 
+from networks.seeded_xfeat import accept_seeded_xfeat, write_seeded_xfeat  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.features import (  # noqa: E402
     Extractor,
@@ -28,24 +29,26 @@ from slimsfm.features import (  # noqa: E402
     unit_rows,
 )
 from slimsfm.features.registry import descriptor_metric_of  # noqa: E402
+from slimsfm.methods.lightglue import lightglue_state  # noqa: E402
 from slimsfm.methods.superglue import SuperGlue, _transport, superglue_state  # noqa: E402
 from slimsfm.methods.superpoint import superpoint_state  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
-RANDOM = ["disk", "superpoint"]
+RANDOM = ["disk", "superpoint", "xfeat"]
 STEP = 32  # shift of pictures in pixels, a multiple of every network's grid
 
 
 @pytest.fixture(scope="session")
 def random_weights(tmp_path_factory):
     writer = run_path(str(Path(__file__).parents[2] / "benchmarks" / "random_weights.py"))
-    return writer["write_random_weights"](tmp_path_factory.mktemp("weights"))
+    return write_seeded_xfeat(writer["write_random_weights"](tmp_path_factory.mktemp("weights")))
 
 
 @pytest.fixture
 def weights(request, monkeypatch, random_weights):
     """The weights folder for the extractor under test."""
+    accept_seeded_xfeat(monkeypatch)
     folder = SHARED if request.getfixturevalue("name") == "aliked" else random_weights
     if not folder.is_dir():
         pytest.skip("needs the trained ALIKED weights in ../shared/weights, which are not here")
@@ -54,6 +57,7 @@ def weights(request, monkeypatch, random_weights):
 
 @pytest.fixture
 def untrained(monkeypatch, random_weights):
+    accept_seeded_xfeat(monkeypatch)
     monkeypatch.setenv(FOLDER, str(random_weights))
 
 
@@ -86,9 +90,9 @@ class TestExtractors:
     def test_shifting_the_picture_shifts_keypoints(self, name, textured):
         """Exactly for SuperPoint; with ALIKED and DISK the border has a weak influence everywhere."""
         extractor = load_extractor(name, {"max_features": 4000})
-        picture = np.zeros((240 + STEP, 320 + STEP, 3), np.uint8)
+        picture = np.zeros((256 + STEP, 320 + STEP, 3), np.uint8)  # XFeat shrinks to multiples of 32
         here, there = picture.copy(), picture.copy()
-        here[:240, :320], there[STEP:, STEP:] = textured, textured
+        here[:240, :320], there[STEP : STEP + 240, STEP:] = textured, textured
         one, other = (inner(extractor.extract(p), shift) for p, shift in ((here, 0), (there, STEP)))
         distances, rows = KDTree(other).query(one)
         near = distances < 1
@@ -134,7 +138,9 @@ MATCHERS = [
     ("lightglue", "aliked", 128),
     ("lightglue", "disk", 128),
     ("lightglue", "sift", 128),
+    ("lighterglue", "xfeat", 64),
     ("nearest", "aliked", 128),
+    ("nearest", "xfeat", 64),
 ]
 
 
@@ -229,7 +235,11 @@ def test_nearest_uses_the_metric_of_the_features():
 
 @pytest.mark.parametrize(
     ("method", "features", "known"),
-    [("superglue", "aliked", "superpoint"), ("lightglue", "orb", "aliked, disk, sift, superpoint")],
+    [
+        ("superglue", "aliked", "superpoint"),
+        ("lightglue", "orb", "aliked, disk, sift, superpoint"),
+        ("lighterglue", "aliked", "xfeat"),
+    ],
 )
 def test_features_that_a_matcher_does_not_know_are_named(method, features, known):
     with pytest.raises(
@@ -247,7 +257,7 @@ def test_sift_features_olderer_maps_lack_what_lightglue_needs():
 
 def test_an_unknown_matcher_is_named():
     with pytest.raises(
-        InputError, match="matcher 'guess' is unknown; known are lightglue, nearest, superglue"
+        InputError, match="matcher 'guess' is unknown; known are lighterglue, lightglue, nearest, superglue"
     ):
         load_matcher("guess", "sift")
 
@@ -261,6 +271,19 @@ def test_the_authors_names_of_values_are_those_of_the_library(random_weights):
     assert shapes == {key: value.shape for key, value in own.items()}
     library = torch.load(random_weights / "superpoint_v1.pth", weights_only=True)
     assert superpoint_state(library).keys() == library.keys()
+
+
+def test_values_of_published_files_that_lightglue_does_not_use_are_left_out():
+    """The file of LighterGlue holds XFeat, and that for DISK a value `r` per layer."""
+    names = {
+        "matcher.transformers.0.self_attn.Wqkv.bias": "transformers.0.self_attn.Wqkv.bias",
+        "cross_attn.8.to_v.bias": "transformers.8.cross_attn.to_v.bias",
+        "log_assignment.0.matchability.bias": "log_assignment.0.matchability.bias",
+        "log_assignment.0.r": None,
+        "extractor.model.net.skip1.1.bias": None,
+    }
+    state = lightglue_state({name: torch.zeros(1) for name in names})
+    assert list(state) == [name for name in names.values() if name]
 
 
 def superglue_of_the_authors() -> dict:

@@ -109,7 +109,11 @@ class _WithoutStops(nn.Module):
 
 def exportable(method: str) -> Exportable:
     """The whole network: from the keypoints of two images to the match of each of the first, or -1."""
-    network = LightGlue(method.removeprefix("lightglue-")).network.cpu()
+    return exportable_network(LightGlue(method.removeprefix("lightglue-")).network.cpu())
+
+
+def exportable_network(network: Network) -> Exportable:
+    """The whole of a network with weights, on the CPU."""
     given = [_example(network, count) for count in (24, 32)]
     inputs = {f"{name}{i + 1}": value for i, one in enumerate(given) for name, value in one.items()}
     return Exportable(
@@ -138,9 +142,15 @@ def network_for(features: str) -> Network:
 
 
 def lightglue_state(checkpoint: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert the authors' state dict, which numbers layers per kind, to that of kornia."""
+    """Convert the authors' state dict, which numbers layers per kind, to that of kornia.
+
+    The file of LighterGlue also holds XFeat, and that for DISK values `r` that the network has no use for.
+    """
     state = {}
     for key, value in checkpoint.items():
+        if key.startswith("extractor.") or (key.startswith("log_assignment.") and key.endswith(".r")):
+            continue
+        key = key.removeprefix("matcher.")
         for kind in ("self_attn", "cross_attn"):
             if key.startswith(f"{kind}."):
                 _, layer, rest = key.split(".", 2)
