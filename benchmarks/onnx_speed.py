@@ -19,6 +19,7 @@ import torch
 from random_weights import write_random_weights
 from slimsfm.features import Features, load_extractor, load_matcher, unit_rows
 from slimsfm.features.registry import export_method
+from slimsfm.weight_files import WEIGHTS
 from slimsfm.weights import Runtime, use_runtime
 
 EXTRACTORS = {
@@ -26,6 +27,7 @@ EXTRACTORS = {
     "aliked-n16": ("aliked", {"model": "aliked-n16"}),
     "aliked-t16": ("aliked", {"model": "aliked-t16"}),
     "disk": ("disk", {}),
+    "xfeat": ("xfeat", {}),
 }
 COUNTS = (512, 1024, 2048)
 SIZE = (640, 480)
@@ -67,7 +69,7 @@ def prepare(output: Path, weights: Path | None) -> tuple[Path, Path]:
         link.unlink(missing_ok=True)
         link.symlink_to(path.resolve())
     use_runtime(Runtime(weights=folders[0], device="cpu"))
-    known = [method for method in EXTRACTORS if not method.startswith("aliked") or weights]
+    known = [method for method in EXTRACTORS if (folders[0] / WEIGHTS[method].file).exists()]
     for method in (*known, "lightglue-aliked"):
         start = perf_counter()
         export_method(method, folders[1] / f"{method}.onnx", overwrite=True)

@@ -43,7 +43,8 @@ from slimsfm.methods.loftr.matcher import Loftr
 from slimsfm.methods.superpoint import SuperPoint, describe_pixels
 from slimsfm.photos import read_image
 from slimsfm.reduction import DominatingSetOptions, dominating_set, keep_random_images
-from slimsfm.weights import WEIGHTS, Runtime, use_runtime
+from slimsfm.weight_files import WEIGHTS
+from slimsfm.weights import Runtime, use_runtime
 
 
 @dataclass(frozen=True, kw_only=True)

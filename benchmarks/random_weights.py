@@ -1,7 +1,7 @@
 """Write weight files with the published names and layouts, filled with seeded random numbers.
 
 They show that methods run, how long they take and what reducing a map saves. Their results are meaningless,
-so they say nothing about accuracy. ALIKED is left out, because its files are checked by checksum.
+so they say nothing about accuracy. ALIKED and XFeat are left out, because they are checked by checksum.
 
     python benchmarks/random_weights.py -o WEIGHTS
 """
@@ -26,7 +26,7 @@ from slimsfm.methods.onepose_plus.network import OnePosePlusMatcher
 
 
 def write_random_weights(folder: Path, seed: int = 0) -> Path:
-    """Write a file for every method except ALIKED."""
+    """Write a file for every method except ALIKED and XFeat."""
     torch.manual_seed(seed)
     superglue = SuperGlueForKeypointMatching(SuperGlueConfig())
     states = {

@@ -1,7 +1,8 @@
-"""Weight files of learned methods: names, sources and licenses, and where a process looks for them.
+"""Where a process finds the weights of learned methods, and where their networks run.
 
-A weight file is looked up in the weights folder, then in the cache of the library through which the authors
-publish it; that library downloads it if there is a network. Nothing here imports the deep-learning stack.
+A weight file is looked up in the weights folder, then in installed packages that carry it, then in the cache
+of the library through which the authors publish it; that library downloads it if there is a network. Nothing
+here imports the deep-learning stack or one of those packages.
 """
 
 import hashlib
@@ -10,18 +11,18 @@ import os
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 from slimsfm.errors import InputError
+from slimsfm.weight_files import WEIGHTS, Package, WeightFile
 
 FOLDER = "SLIMSFM_WEIGHTS"
 """Environment variable with the user's default weights folder."""
 
 DEVICE = "SLIMSFM_DEVICE"
 """Environment variable with the user's default device: auto, cpu or cuda."""
-
-_RESEARCH = "Magic Leap: research only"
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
@@ -31,7 +32,7 @@ class Runtime:
     """Where learned methods find their weights, and where their networks run."""
 
     weights: Path | None = None
-    """Folder of weight files; None: only the caches of the libraries are searched."""
+    """Folder of weight files; None: only packages and the caches of the libraries are searched."""
 
     device: DeviceName = "auto"
     """Device of the networks; auto: a GPU if there is one."""
@@ -102,112 +103,50 @@ def current_runtime() -> Runtime:
     return _used or Runtime.from_environment()
 
 
-@dataclass(frozen=True, kw_only=True)
-class WeightFile:
-    """A published file of trained weights."""
+class FoundWeights(NamedTuple):
+    """A weight file that was found."""
 
-    file: str
-    """File name, as published by the authors."""
+    path: Path
+    """The file."""
 
-    source: str
-    """Who publishes the file."""
-
-    license: str
-    """License of the weights."""
-
-    hub: tuple[str, ...] = ()
-    """Addresses from which the library downloads it, or `hf:OWNER/REPOSITORY/FILE`; may be empty."""
-
-    sha256: str | None = None
-    """Checksum; None if unknown: then only names and shapes of the values are validated."""
-
-    @property
-    def is_research_only(self) -> bool:
-        """Whether commercial use is forbidden."""
-        return self.license == _RESEARCH
+    origin: str
+    """Where it was found, to be read by people."""
 
 
-def _aliked(name: str, sha256: str) -> WeightFile:
-    return WeightFile(
-        file=f"{name}.pth",
-        source="the ALIKED repository of Shiaoming",
-        license="BSD-3-Clause",
-        hub=(f"https://github.com/Shiaoming/ALIKED/raw/main/models/{name}.pth",),
-        sha256=sha256,
-    )
-
-
-def _lightglue(features: str) -> WeightFile:
-    return WeightFile(
-        file=f"{features}_lightglue.pth",
-        source="the LightGlue repository of cvg, release v0.1_arxiv",
-        license="Apache-2.0",
-        hub=(f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{features}_lightglue.pth",),
-    )
-
-
-WEIGHTS = {
-    "aliked-n16": _aliked("aliked-n16", "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
-    "aliked-t16": _aliked("aliked-t16", "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085"),
-    "disk": WeightFile(
-        file="depth-save.pth",
-        source="the DISK repository of cvlab-epfl",
-        license="Apache-2.0",
-        hub=("hf:kornia/disk/depth-save.pth",),
-    ),
-    "superpoint": WeightFile(
-        file="superpoint_v1.pth",
-        source="the SuperGluePretrainedNetwork repository of magicleap",
-        license=_RESEARCH,
-        hub=("hf:magic-leap-community/superpoint/model.safetensors",),
-    ),
-    "superglue": WeightFile(
-        file="superglue_outdoor.pth",
-        source="the SuperGluePretrainedNetwork repository of magicleap",
-        license=_RESEARCH,
-        hub=("hf:magic-leap-community/superglue_outdoor/model.safetensors",),
-    ),
-    **{f"lightglue-{name}": _lightglue(name) for name in ("aliked", "disk", "sift", "superpoint")},
-    "loftr": WeightFile(
-        file="loftr_outdoor.ckpt",
-        source="the LoFTR repository of zju3dv",
-        license="Apache-2.0",
-        hub=("hf:kornia/loftr/loftr_outdoor.ckpt",),
-    ),
-    "loftr-onepose++": WeightFile(
-        file="LoFTR_wsize9.ckpt",
-        source="the OnePose_Plus_Plus repository of zju3dv, whose README links it",
-        license="Apache-2.0",
-    ),
-    "onepose": WeightFile(
-        file="GATsSPG.ckpt",
-        source="the OnePose repository of zju3dv, whose README links it",
-        license="Apache-2.0",
-    ),
-    "onepose++": WeightFile(
-        file="OnePosePlus_model.ckpt",
-        source="the OnePose_Plus_Plus repository of zju3dv, whose README links it",
-        license="Apache-2.0",
-    ),
-}
-"""Every weight file of a built-in method."""
-
-
-def find_weights(name: str) -> Path | None:
-    """Find weights in the weights folder and validate their checksum; None if they are not there.
+def find_weights(name: str) -> FoundWeights | None:
+    """Find weights in the weights folder or in an installed package, and validate their checksum.
 
     Args:
         name: Key of `WEIGHTS`.
+
+    Returns:
+        The file; None if it is in neither.
 
     Raises:
         InputError: The folder does not exist, or the file is not the published one.
     """
     weights, folder = WEIGHTS[name], current_runtime().weights
     path = folder / weights.file if folder else None
-    if path is None or not path.is_file():
+    if path is not None and path.is_file():
+        check_weights(path, weights)
+        return FoundWeights(path, "weights folder")
+    return _from_package(weights.package) if weights.package else None
+
+
+def _from_package(package: Package) -> FoundWeights | None:
+    try:
+        installed = distribution(package.name)
+    except PackageNotFoundError:
         return None
-    check_weights(path, weights)
-    return path
+    path = Path(str(installed.locate_file(package.file)))
+    if not path.is_file():
+        return None
+    if _checksum_of(path) != package.sha256:
+        raise InputError(
+            f"{path}: not the published weights (the checksum differs); install the package again: "
+            f"{package.install} --force-reinstall"
+        )
+    return FoundWeights(path, f"package {package.name} {installed.version}")
 
 
 def check_weights(path: Path, weights: WeightFile) -> None:
@@ -216,29 +155,64 @@ def check_weights(path: Path, weights: WeightFile) -> None:
     Raises:
         InputError: The checksum differs, or the file cannot be read.
     """
-    if weights.sha256 is None:
-        return
-    stat = path.stat()
-    if _sha256(path, stat.st_size, stat.st_mtime_ns) != weights.sha256:
+    if weights.sha256 is not None and _checksum_of(path) != weights.sha256:
         raise InputError(
             f"{path}: not the published weights (the checksum differs); "
             f"get {weights.file} from {weights.source}"
         )
 
 
-@cache
-def _sha256(path: Path, _size: int, _changed: int) -> str:
+def _checksum_of(path: Path) -> str:
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        stat = path.stat()
+        return _sha256(path, stat.st_size, stat.st_mtime_ns)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
+@cache
+def _sha256(path: Path, _size: int, _changed: int) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def cached_weights(name: str) -> FoundWeights | None:
+    """Find weights in the caches of PyTorch and Hugging Face, without their libraries and without a network.
+
+    Args:
+        name: Key of `WEIGHTS`.
+    """
+    for address in WEIGHTS[name].hub:
+        if address.startswith("hf:"):
+            owner, repository, file = address.removeprefix("hf:").split("/")
+            found = sorted(_hugging_face().glob(f"models--{owner}--{repository}/snapshots/*/{file}"))
+            library = "Hugging Face"
+        else:
+            found = [_torch() / "hub" / "checkpoints" / address.rpartition("/")[2]]
+            library = "PyTorch"
+        if found and found[0].is_file():
+            return FoundWeights(found[0], f"cache of {library}")
+    return None
+
+
+def _torch() -> Path:
+    return Path(os.environ.get("TORCH_HOME") or _caches() / "torch").expanduser()
+
+
+def _hugging_face() -> Path:
+    home = Path(os.environ.get("HF_HOME") or _caches() / "huggingface")
+    return Path(os.environ.get("HF_HUB_CACHE") or home / "hub").expanduser()
+
+
+def _caches() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
+
+
 def missing(weights: WeightFile) -> InputError:
-    """The error for weights that are neither in the weights folder nor can be downloaded."""
+    """The error for weights that were not found and cannot be downloaded."""
     where = next((f" ({one})" for one in weights.hub if not one.startswith("hf:")), "")
+    package = f"install them with {weights.package.install}, or " if weights.package else ""
     return InputError(
-        f"the weights {weights.file} are missing and could not be downloaded; get them from "
+        f"the weights {weights.file} are missing and could not be downloaded; {package}get them from "
         f"{weights.source}{where}, license {weights.license}, put the file into a folder, and set the "
         f"weights folder to it (environment variable {FOLDER})"
     )

@@ -9,7 +9,8 @@ from transformers import SuperPointConfig, SuperPointForKeypointDetection  # noq
 from commands import contents, slimsfm  # noqa: E402
 from networks.seeded import fill  # noqa: E402
 from slimsfm.features.registry import EXPORTABLE  # noqa: E402
-from slimsfm.weights import FOLDER, WEIGHTS  # noqa: E402
+from slimsfm.weight_files import WEIGHTS  # noqa: E402
+from slimsfm.weights import FOLDER  # noqa: E402
 
 
 @pytest.fixture

@@ -49,14 +49,16 @@ def test_methods_are_listed_with_licenses_and_found_weights(tmp_path):
         "aliked",
         "disk",
         "superpoint",
+        "xfeat",
         "nearest",
         "superglue",
         "lightglue",
+        "lighterglue",
         "loftr",
     }
     assert "research only" in lines["superpoint"]
-    assert lines["disk"].rstrip().endswith("yes")
-    assert "another file has this name" in lines["aliked"]
+    assert lines["disk"].rstrip().endswith("weights folder")
+    assert "no: not the published file" in lines["aliked"]
 
 
 def test_classical_methods_need_no_network_stack(boulder, tmp_path):
@@ -67,7 +69,7 @@ def test_classical_methods_need_no_network_stack(boulder, tmp_path):
     assert out.exists()
 
 
-@pytest.mark.parametrize("extractor", ["aliked", "disk", "superpoint"])
+@pytest.mark.parametrize("extractor", ["aliked", "disk", "superpoint", "xfeat"])
 def test_without_it_a_learned_method_says_which_extra_to_install(boulder, tmp_path, extractor):
     done = slimsfm_without_torch("build", boulder.photos, "-o", tmp_path / "map", "--extractor", extractor)
     assert done.returncode == 2
@@ -80,10 +82,10 @@ def test_an_unknown_extractor_or_matcher_or_folder_is_named(boulder, tmp_path):
     out = tmp_path / "map"
     found = slimsfm("build", boulder.photos, "-o", out, "--extractor", "orb")
     assert (found.code, found.err.count("\n")) == (2, 1)
-    assert "extractor 'orb' is unknown; known are aliked, disk, loftr, sift, superpoint" in found.err
+    assert "extractor 'orb' is unknown; known are aliked, disk, loftr, sift, superpoint, xfeat" in found.err
     found = slimsfm("build", boulder.photos, "-o", out, "--matcher", "guess")
     assert found.code == 2
-    assert "matcher 'guess' is unknown; known are lightglue, nearest, superglue" in found.err
+    assert "matcher 'guess' is unknown; known are lighterglue, lightglue, nearest, superglue" in found.err
     found = slimsfm("build", boulder.photos, "-o", out, "--matcher", "superglue")
     assert found.code == 2
     assert "features must be superpoint" in found.err or "pip install 'slimsfm[learned]'" in found.err

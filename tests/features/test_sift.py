@@ -153,7 +153,7 @@ def test_bad_options_are_named(values):
 
 def test_unknown_extractors_and_options_are_input_errors():
     with pytest.raises(
-        InputError, match="'magic' is unknown; known are aliked, disk, loftr, sift, superpoint"
+        InputError, match="'magic' is unknown; known are aliked, disk, loftr, sift, superpoint, xfeat"
     ):
         load_extractor("magic")
     with pytest.raises(InputError, match=r"'sift'.*colour"):

@@ -64,13 +64,16 @@ def test_the_contract_of_a_source(maps, scene, edges):
     listed = pairs.tolist()
     assert listed == sorted(listed)
     assert len({tuple(pair) for pair in listed}) == len(listed) > 0
-    errors = [as_tuple(source.errors(u, v)) for u, v in listed]
+    errors = [as_tuple(one) for one in source.errors(pairs)]
     assert np.min(errors) >= 0
     again = edge_source(map_, options)
     assert np.array_equal(again.pairs(), pairs)
-    backwards = [as_tuple(again.errors(u, v)) for u, v in reversed(listed)]
+    backwards = [
+        as_tuple(one) for row in range(len(pairs))[::-1] for one in again.errors(pairs[row : row + 1])
+    ]
     assert backwards[::-1] == errors
-    assert [as_tuple(source.errors(v, u)) for u, v in listed] == [pair[::-1] for pair in errors]
+    assert [as_tuple(one) for one in source.errors(pairs[:, ::-1])] == [pair[::-1] for pair in errors]
+    assert source.errors(pairs[:0]) == []
     graph = compute_graph(map_, options).graph.dense()
     assert [(graph[u, v], graph[v, u]) for u, v in listed] == errors
     others = ~np.eye(len(graph), dtype=bool)
@@ -113,7 +116,7 @@ def test_a_matched_keypoint_localizes_only_where_it_sees_a_point():
     for row in map_.model.image(blind).get_observation_point2D_idxs():
         map_.model.delete_observation(blind, row)
     map_ = replace(map_, model=map_.model)
-    found = MatchEdges(map_, OPTIONS).errors(0, 1)
+    found = MatchEdges(map_, OPTIONS).errors(np.array([[0, 1]]))[0]
     assert found.v_from_u < EXACT
     assert np.isinf(found.u_from_v)
 
@@ -142,13 +145,13 @@ def test_auto_is_matches_or_tracks_where_there_are_none(exact):
 def localized(monkeypatch):
     """The edges (reference, query) that are decided by matching again."""
     edges = []
-    localize = LocalizeEdges.error
+    localize = LocalizeEdges.errors_of
 
-    def counted(self, reference, query):
-        edges.append((reference, query))
-        return localize(self, reference, query)
+    def counted(self, directed):
+        edges.extend(directed)
+        return localize(self, directed)
 
-    monkeypatch.setattr(LocalizeEdges, "error", counted)
+    monkeypatch.setattr(LocalizeEdges, "errors_of", counted)
     return edges
 
 
@@ -171,10 +174,11 @@ def test_hybrid_looks_closer_at_missing_poses_and_at_errors_near_the_threshold(b
     matched_pairs = {tuple(pair) for pair in matched.pairs().tolist()}
     decided = 0
     for u, v in hybrid.pairs()[::3].tolist():
-        found = as_tuple(hybrid.errors(u, v))
+        pair = np.array([[u, v]])
+        found = as_tuple(hybrid.errors(pair)[0])
         asked = localized.copy()
-        by_matches = as_tuple(matched.errors(u, v)) if (u, v) in matched_pairs else (np.inf, np.inf)
-        by_localizing = as_tuple(again.errors(u, v))
+        by_matches = as_tuple(matched.errors(pair)[0]) if (u, v) in matched_pairs else (np.inf, np.inf)
+        by_localizing = as_tuple(again.errors(pair)[0])
         is_open = [error == np.inf or 0.01 <= error <= 0.04 for error in by_matches]
         assert asked == [edge for edge, open_ in zip([(u, v), (v, u)], is_open, strict=True) if open_]
         assert found == tuple(np.where(is_open, by_localizing, by_matches))

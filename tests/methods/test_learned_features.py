@@ -14,7 +14,9 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("kornia")
 pytest.importorskip("transformers")
 
+from transformers.models.superglue.modeling_superglue import log_optimal_transport  # noqa: E402
 
+from networks.seeded_xfeat import accept_seeded_xfeat, write_seeded_xfeat  # noqa: E402
 from slimsfm.errors import InputError  # noqa: E402
 from slimsfm.features import (  # noqa: E402
     Extractor,
@@ -22,28 +24,31 @@ from slimsfm.features import (  # noqa: E402
     Matcher,
     load_extractor,
     load_matcher,
+    match_many,
     match_nearest,
     unit_rows,
 )
 from slimsfm.features.registry import descriptor_metric_of  # noqa: E402
-from slimsfm.methods.superglue import superglue_state  # noqa: E402
+from slimsfm.methods.lightglue import lightglue_state  # noqa: E402
+from slimsfm.methods.superglue import SuperGlue, _transport, superglue_state  # noqa: E402
 from slimsfm.methods.superpoint import superpoint_state  # noqa: E402
 from slimsfm.weights import FOLDER  # noqa: E402
 
 SHARED = Path(__file__).parents[3] / "shared" / "weights"
-RANDOM = ["disk", "superpoint"]
+RANDOM = ["disk", "superpoint", "xfeat"]
 STEP = 32  # shift of pictures in pixels, a multiple of every network's grid
 
 
 @pytest.fixture(scope="session")
 def random_weights(tmp_path_factory):
     writer = run_path(str(Path(__file__).parents[2] / "benchmarks" / "random_weights.py"))
-    return writer["write_random_weights"](tmp_path_factory.mktemp("weights"))
+    return write_seeded_xfeat(writer["write_random_weights"](tmp_path_factory.mktemp("weights")))
 
 
 @pytest.fixture
 def weights(request, monkeypatch, random_weights):
     """The weights folder for the extractor under test."""
+    accept_seeded_xfeat(monkeypatch)
     folder = SHARED if request.getfixturevalue("name") == "aliked" else random_weights
     if not folder.is_dir():
         pytest.skip("needs the trained ALIKED weights in ../shared/weights, which are not here")
@@ -52,6 +57,7 @@ def weights(request, monkeypatch, random_weights):
 
 @pytest.fixture
 def untrained(monkeypatch, random_weights):
+    accept_seeded_xfeat(monkeypatch)
     monkeypatch.setenv(FOLDER, str(random_weights))
 
 
@@ -84,9 +90,9 @@ class TestExtractors:
     def test_shifting_the_picture_shifts_keypoints(self, name, textured):
         """Exactly for SuperPoint; with ALIKED and DISK the border has a weak influence everywhere."""
         extractor = load_extractor(name, {"max_features": 4000})
-        picture = np.zeros((240 + STEP, 320 + STEP, 3), np.uint8)
+        picture = np.zeros((256 + STEP, 320 + STEP, 3), np.uint8)  # XFeat shrinks to multiples of 32
         here, there = picture.copy(), picture.copy()
-        here[:240, :320], there[STEP:, STEP:] = textured, textured
+        here[:240, :320], there[STEP : STEP + 240, STEP:] = textured, textured
         one, other = (inner(extractor.extract(p), shift) for p, shift in ((here, 0), (there, STEP)))
         distances, rows = KDTree(other).query(one)
         near = distances < 1
@@ -132,7 +138,9 @@ MATCHERS = [
     ("lightglue", "aliked", 128),
     ("lightglue", "disk", 128),
     ("lightglue", "sift", 128),
+    ("lighterglue", "xfeat", 64),
     ("nearest", "aliked", 128),
+    ("nearest", "xfeat", 64),
 ]
 
 
@@ -140,7 +148,7 @@ MATCHERS = [
 @pytest.mark.parametrize(
     ("method", "features", "dimensions"), MATCHERS, ids=["-".join(m[:2]) for m in MATCHERS]
 )
-def test_every_matcher_keeps_the_contract(method, features, dimensions):
+def test_every_matcher_keeps_the_contract(method, features, dimensions, monkeypatch):
     rng = np.random.default_rng(0)
     one, other = described(rng, 60, dimensions), described(rng, 45, dimensions, (320, 240))
     matcher = load_matcher(method, features)
@@ -153,6 +161,65 @@ def test_every_matcher_keeps_the_contract(method, features, dimensions):
     assert len(set(pairs[:, 1])) == len(pairs)
     empty = one[np.zeros(0, np.int64)]
     assert matcher.match(empty, other).shape == matcher.match(other, empty).shape == (0, 2)
+    many = [(one, other), (empty, other), (other, one), (one, one[np.arange(7)]), (other, empty)]
+    for memory in (0, 10**9):  # keypoint pairs: on a CPU, and on a GPU, where they come in one batch
+        monkeypatch.setattr("slimsfm.networks.batches.keypoint_pairs_of", lambda _, memory=memory: memory)
+        found = match_many(matcher, many)
+        assert len(found) == len(many)
+        assert all(map(np.array_equal, found, [matcher.match(*pair) for pair in many]))
+    assert match_many(matcher, []) == []
+
+
+@pytest.fixture
+def sharp():
+    """SuperGlue with seeded weights that compares little but descriptors, and so matches similar ones."""
+    matcher = SuperGlue("superpoint")
+    with torch.no_grad():
+        matcher.network.final_projection.final_proj.weight.copy_(16 * torch.eye(256))
+    return matcher
+
+
+@pytest.mark.usefixtures("untrained")
+def test_superglue_scores_and_matches_in_a_batch_are_those_of_each_pair(sharp, monkeypatch):
+    rng = np.random.default_rng(2)
+    one = described(rng, 60, 256)
+    pairs = []
+    for count, others, size in (
+        (40, 0, (640, 480)),
+        (10, 70, (320, 240)),
+        (1, 0, (640, 480)),
+        (0, 30, (480, 640)),
+    ):
+        new = described(rng, count + others, 256, size)
+        same = one.descriptors[rng.permutation(60)[:count]].astype(np.float32)
+        noisy = unit_rows(same + 0.02 * rng.normal(size=same.shape))
+        pairs.append((one, replace(new, descriptors=np.concatenate([noisy, new.descriptors[count:]]))))
+    with torch.inference_mode():
+        together = sharp.scores(pairs, torch.device("cpu"))
+        for row, pair in enumerate(pairs):
+            alone = sharp.scores([pair], torch.device("cpu"))[0]
+            rows, columns = ([*range(len(features)), -1] for features in pair)
+            assert torch.allclose(together[row][rows][:, columns], alone, atol=1e-4)
+            assert (together[row][:-1, len(pair[1]) : -1] == -torch.inf).all()
+    monkeypatch.setattr("slimsfm.networks.batches.keypoint_pairs_of", lambda _: 10**9)
+    found = sharp.match_many(pairs)
+    assert all(map(np.array_equal, found, [sharp.match(*pair) for pair in pairs]))
+    assert [len(matches) > count / 2 for matches, count in zip(found, (40, 10, 1), strict=False)] == [
+        True
+    ] * 3
+
+
+def test_superglue_transports_as_the_library_does():
+    generator = torch.Generator().manual_seed(0)
+    products, bin_score = 3 * torch.randn(2, 30, 20, generator=generator), torch.tensor(1.5)
+    everything = torch.ones(2, 30, dtype=torch.bool), torch.ones(2, 20, dtype=torch.bool)
+    expected = log_optimal_transport(products, bin_score, 100)
+    assert torch.allclose(_transport(products, bin_score, *everything), expected, atol=1e-5)
+    some = everything[0], torch.arange(20).expand(2, -1) < 12
+    found = _transport(products, bin_score, *some)
+    expected = log_optimal_transport(products[:, :, :12], bin_score, 100)
+    assert torch.allclose(found[:, :, [*range(12), -1]], expected, atol=1e-5)
+    assert (found[:, :, 12:-1] == -torch.inf).all()
 
 
 def test_nearest_uses_the_metric_of_the_features():
@@ -168,7 +235,11 @@ def test_nearest_uses_the_metric_of_the_features():
 
 @pytest.mark.parametrize(
     ("method", "features", "known"),
-    [("superglue", "aliked", "superpoint"), ("lightglue", "orb", "aliked, disk, sift, superpoint")],
+    [
+        ("superglue", "aliked", "superpoint"),
+        ("lightglue", "orb", "aliked, disk, sift, superpoint"),
+        ("lighterglue", "aliked", "xfeat"),
+    ],
 )
 def test_features_that_a_matcher_does_not_know_are_named(method, features, known):
     with pytest.raises(
@@ -186,7 +257,7 @@ def test_sift_features_olderer_maps_lack_what_lightglue_needs():
 
 def test_an_unknown_matcher_is_named():
     with pytest.raises(
-        InputError, match="matcher 'guess' is unknown; known are lightglue, nearest, superglue"
+        InputError, match="matcher 'guess' is unknown; known are lighterglue, lightglue, nearest, superglue"
     ):
         load_matcher("guess", "sift")
 
@@ -200,6 +271,19 @@ def test_the_authors_names_of_values_are_those_of_the_library(random_weights):
     assert shapes == {key: value.shape for key, value in own.items()}
     library = torch.load(random_weights / "superpoint_v1.pth", weights_only=True)
     assert superpoint_state(library).keys() == library.keys()
+
+
+def test_values_of_published_files_that_lightglue_does_not_use_are_left_out():
+    """The file of LighterGlue holds XFeat, and that for DISK a value `r` per layer."""
+    names = {
+        "matcher.transformers.0.self_attn.Wqkv.bias": "transformers.0.self_attn.Wqkv.bias",
+        "cross_attn.8.to_v.bias": "transformers.8.cross_attn.to_v.bias",
+        "log_assignment.0.matchability.bias": "log_assignment.0.matchability.bias",
+        "log_assignment.0.r": None,
+        "extractor.model.net.skip1.1.bias": None,
+    }
+    state = lightglue_state({name: torch.zeros(1) for name in names})
+    assert list(state) == [name for name in names.values() if name]
 
 
 def superglue_of_the_authors() -> dict:

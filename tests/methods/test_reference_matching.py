@@ -87,7 +87,7 @@ def test_it_matches_references_as_others_do(sphere):
 def test_matches_are_where_the_points_are_seen(sphere, step):
     """Whether photo and query are as large as their cameras say or half as large."""
     matching = DetectorFreeMatching(sphere, matcher)
-    found = matching.match(query(step), 1, None)
+    found = matching.match([(query(step), 1)], None)[0]
     assert len(found) > 20
     assert len(np.unique(found.points)) == len(found)
     points3D = sphere.points3D_in_world[found.points]
@@ -97,7 +97,7 @@ def test_matches_are_where_the_points_are_seen(sphere, step):
 
 def test_an_exact_scene_localizes(sphere):
     matching = DetectorFreeMatching(sphere, matcher)
-    found = unite([matching.match(query(), row, None) for row in range(len(NAMES))])
+    found = unite(matching.match([(query(), row) for row in range(len(NAMES))], None))
     assert found.references == len(NAMES)
     pose = estimate_pose(found.pixels(query()), sphere.points3D_in_world[found.points], camera())
     assert pose is not None
@@ -107,7 +107,7 @@ def test_an_exact_scene_localizes(sphere):
 def test_a_map_of_fewer_images_localizes_too(sphere):
     slim = keep_images(sphere, NAMES[1:3])
     matching = DetectorFreeMatching(slim, matcher)
-    found = unite([matching.match(query(), row, None) for row in range(2)])
+    found = unite(matching.match([(query(), row) for row in range(2)], None))
     pose = estimate_pose(found.pixels(query()), slim.points3D_in_world[found.points], camera())
     assert pose is not None
     assert corner_error(pose.cam_from_world, POSES[5], BOX) < 1e-5
@@ -115,7 +115,7 @@ def test_a_map_of_fewer_images_localizes_too(sphere):
 
 def test_a_view_of_nothing_in_common_gives_no_match(sphere):
     behind = SphereMatcher([*POSES[:5], look_at(np.array([-5.0, -3, 0]), np.zeros(3))], camera(), 16.0)
-    found = DetectorFreeMatching(sphere, lambda: behind).match(query(), 1, None)
+    found = DetectorFreeMatching(sphere, lambda: behind).match([(query(), 1)], None)[0]
     assert len(found) == 0
     assert found.pixels(query()).shape == (0, 2)
 
@@ -134,7 +134,7 @@ def test_missing_photos_and_images_are_errors(sphere):
     with pytest.raises(InputError, match="with the extractor loftr"):
         DetectorFreeMatching(replace(sphere, photos={}), matcher)
     with pytest.raises(InputError, match="image"):
-        DetectorFreeMatching(sphere, matcher).match(replace(query(), image=None), 0, None)
+        DetectorFreeMatching(sphere, matcher).match([(replace(query(), image=None), 0)], None)
 
 
 @pytest.fixture

@@ -108,7 +108,7 @@ def hub(monkeypatch, tmp_path):
 
 @pytest.mark.usefixtures("hub")
 def test_missing_weights_are_named_without_a_network(tmp_path):
-    message = r"weights depth-save\.pth are missing .*; get them from the DISK repository of cvlab-epfl"
+    message = r"weights depth-save\.pth are missing .*get them from the DISK repository of cvlab-epfl"
     with use_runtime(Runtime(weights=tmp_path)), pytest.raises(InputError, match=message):
         load_network(network(), "disk")
 

@@ -11,7 +11,8 @@ from slimsfm.cli.options import Advanced
 from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.features.registry import plugins
-from slimsfm.weights import WEIGHTS, find_weights
+from slimsfm.weight_files import WEIGHTS
+from slimsfm.weights import cached_weights, current_runtime, find_weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +22,7 @@ class _Method:
     by: str
     license: str
     weights: tuple[str, ...] = ()
+    needs_torch: bool = True  # also if there is an ONNX file
 
 
 _LEARNED = ("torch", "kornia", "transformers")  # required by methods with weights
@@ -41,6 +43,14 @@ _METHODS = (
         license="Apache-2.0",
         weights=("superpoint",),
     ),
+    _Method(
+        kind="extractor",
+        name="xfeat",
+        by="kornia",
+        license="Apache-2.0",
+        weights=("xfeat",),
+        needs_torch=False,
+    ),
     _Method(kind="matcher", name="nearest", by="slimsfm", license="BSD-3-Clause"),
     _Method(
         kind="matcher",
@@ -49,6 +59,7 @@ _METHODS = (
         license="Apache-2.0",
         weights=tuple(name for name in WEIGHTS if name.startswith("lightglue-")),
     ),
+    _Method(kind="matcher", name="lighterglue", by="kornia", license="Apache-2.0", weights=("lighterglue",)),
     _Method(
         kind="matcher",
         name="superglue",
@@ -102,9 +113,10 @@ def methods(networks: Annotated[Networks, Advanced()] = Networks()) -> None:
         for name, path in sorted(plugins(kind).items()):
             table.add_row(kind, name, path, "its own", "", "", "plug-in")
     console.print(table)
+    packages = " and ".join(sorted({one.package.name for one in WEIGHTS.values() if one.package}))
     console.print(
-        "weights are searched for in --weights or $SLIMSFM_WEIGHTS, then in the caches of the libraries, "
-        "which download them if there is a network",
+        f"weights are searched for in --weights or $SLIMSFM_WEIGHTS, then in the packages {packages}, "
+        "then in the caches of the libraries, which download them if there is a network",
         style="dim",
     )
 
@@ -115,9 +127,17 @@ def _installed(method: _Method) -> str:
 
 
 def _found(method: _Method, name: str) -> str:
-    if (installed := _installed(method)) != "yes":
+    """Where weights come from, and whether they run."""
+    folder = current_runtime().weights
+    exported = " and ONNX" if folder and (folder / f"{name}.onnx").is_file() else ""
+    runs_without = exported and not method.needs_torch and find_spec("onnxruntime")
+    if (installed := _installed(method)) != "yes" and not runs_without:
         return installed
     try:
-        return "yes" if find_weights(name) else "not in the folder"
+        found = find_weights(name) or cached_weights(name)
     except InputError:
-        return "no: another file has this name"
+        return "no: not the published file"
+    if found:
+        return found.origin + exported
+    package = WEIGHTS[name].package
+    return exported.removeprefix(" and ") or ("no: " + package.install if package else "no")

@@ -1,11 +1,13 @@
 """Local features: data types, extractors, matchers and descriptor matching."""
 
 from slimsfm.features.base import (
+    BatchMatcher,
     Extractor,
     Features,
     Matcher,
     NearestOptions,
     image_colors,
+    match_many,
     shrink_factor,
     unit_rows,
     unmasked,
@@ -16,6 +18,7 @@ from slimsfm.features.registry import EXTRACTORS, MATCHERS, load_extractor, load
 __all__ = [
     "EXTRACTORS",
     "MATCHERS",
+    "BatchMatcher",
     "Extractor",
     "Features",
     "Matcher",
@@ -23,6 +26,7 @@ __all__ = [
     "image_colors",
     "load_extractor",
     "load_matcher",
+    "match_many",
     "match_nearest",
     "runs_on_one_core",
     "shrink_factor",

@@ -1,6 +1,6 @@
 """Local features, and the protocols of extractors and matchers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -96,6 +96,22 @@ class Matcher(Protocol):
     def match(self, features1: Features, features2: Features) -> IndexPairs:
         """Match two images. Each feature occurs at most once; pairs are sorted by the first feature."""
         ...
+
+
+@runtime_checkable
+class BatchMatcher(Matcher, Protocol):
+    """A matcher that matches several pairs of images at once sooner than one after the other."""
+
+    def match_many(self, pairs: Sequence[tuple[Features, Features]]) -> list[IndexPairs]:
+        """Match pairs of images; the result for each equals that of `match` up to rounding."""
+        ...
+
+
+def match_many(matcher: Matcher, pairs: Sequence[tuple[Features, Features]]) -> list[IndexPairs]:
+    """Match pairs of images at once if the matcher can, else one after the other."""
+    if isinstance(matcher, BatchMatcher):
+        return matcher.match_many(pairs)
+    return [matcher.match(one, other) for one, other in pairs]
 
 
 def shrink_factor(extractor_options: Mapping, width: int, height: int) -> float:

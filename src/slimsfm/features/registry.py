@@ -58,10 +58,17 @@ EXTRACTORS = {
         descriptor_length=256,
         signed=True,
     ),
+    "xfeat": ExtractorEntry(
+        path="slimsfm.methods.xfeat:XFeat",
+        descriptor_metric=NearestOptions(max_ratio=0.98, max_distance=0.7),
+        descriptor_length=64,
+        signed=True,
+    ),
 }
 """Built-in extractors. The class of a plug-in may have attributes named as the fields of `ExtractorEntry`."""
 
 MATCHERS = {
+    "lighterglue": "slimsfm.methods.lighterglue:LighterGlue",
     "lightglue": "slimsfm.methods.lightglue:LightGlue",
     "nearest": "slimsfm.features.nearest:Nearest",
     "superglue": "slimsfm.methods.superglue:SuperGlue",
@@ -74,11 +81,13 @@ EXPORTABLE = {
     "aliked-n16": "slimsfm.methods.aliked:exportable",
     "aliked-t16": "slimsfm.methods.aliked:exportable",
     "disk": "slimsfm.methods.disk:exportable",
+    "lighterglue": "slimsfm.methods.lighterglue:exportable",
     "lightglue-aliked": "slimsfm.methods.lightglue:exportable",
     "lightglue-disk": "slimsfm.methods.lightglue:exportable",
     "lightglue-sift": "slimsfm.methods.lightglue:exportable",
     "lightglue-superpoint": "slimsfm.methods.lightglue:exportable",
     "superpoint": "slimsfm.methods.superpoint:exportable",
+    "xfeat": "slimsfm.methods.xfeat_network:exportable",
 }
 """Functions that return the exportable part of a network, by the name of the network's weights."""
 

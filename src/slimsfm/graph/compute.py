@@ -79,7 +79,8 @@ def compute_graph(
     """Find out which reference images localize which others.
 
     The result does not depend on where and in which blocks the work is done, bit for bit: all pairs use equal
-    seeds and one thread, because matrix products on several threads may round differently.
+    seeds and one thread, because matrix products on several threads may round differently. Networks on a GPU
+    are an exception: they round differently for other pairs in a batch.
 
     Raises:
         WorkError: A block of pairs failed repeatedly.
@@ -203,7 +204,7 @@ def _solve_all(
 def solve(source: EdgeSource, pairs: PairIndices) -> Errors:
     """Localize pairs of images from each other, on one thread."""
     with threadpool_limits(1):
-        found = [source.errors(int(u), int(v)) for u, v in pairs]
+        found = source.errors(pairs)
     return np.array([(one.v_from_u, one.u_from_v) for one in found], np.float64).reshape(-1, 2)
 
 

@@ -5,6 +5,7 @@ References:
 """
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -72,14 +73,14 @@ class PairErrors:
 
 @runtime_checkable
 class EdgeSource(Protocol):
-    """Localizes two reference images of one map from each other. Equal pairs have equal errors."""
+    """Localizes reference images of one map from each other, two by two. Equal pairs have equal errors."""
 
     def pairs(self) -> PairIndices:
         """Return the pairs to try, in lexicographic order; all other pairs have no edge."""
         ...
 
-    def errors(self, u: int, v: int) -> PairErrors:
-        """Localize two images from each other, given by their indices in the order of names."""
+    def errors(self, pairs: PairIndices) -> list[PairErrors]:
+        """Localize the images of each pair from each other; u may be greater than v."""
         ...
 
 
@@ -189,6 +190,7 @@ def _sorted(pairs: Int64[np.ndarray, "k 2"]) -> Int64[np.ndarray, "_ 2"]:
 
 _CACHED_IMAGES = 256
 _CACHED_QUERIES = 64  # 2 MB each with 4096 descriptors of 128 numbers
+_TOGETHER = 64  # queries and references that are matched in one call
 _MOST_MATCHES = 100  # per pose: stored matches are verified, so more of them hardly change it
 _NEAR = 2.0  # an error within this factor of the threshold may fall on either side of it
 _MIN_COMMON_POINTS = 20  # a pair without stored matches is worth matching from here
@@ -246,8 +248,11 @@ class MatchEdges:
         pairs = np.array(found, np.int64).reshape(-1, 2)
         return np.unique(np.sort(pairs, axis=1), axis=0)
 
-    def errors(self, u: int, v: int) -> PairErrors:
-        """Localize u and v from each other."""
+    def errors(self, pairs: PairIndices) -> list[PairErrors]:
+        """Localize the images of each pair from each other."""
+        return [self._errors(u, v) for u, v in pairs.tolist()]
+
+    def _errors(self, u: int, v: int) -> PairErrors:
         rows_u, rows_v = self._matches(u, v).T
         return PairErrors(
             v_from_u=self._error(u, rows_u, v, rows_v), u_from_v=self._error(v, rows_v, u, rows_u)
@@ -286,8 +291,11 @@ class TrackEdges:
         """Return the pairs that see enough common points for a pose."""
         return covisible_pairs(self._references.map, self._min_points)
 
-    def errors(self, u: int, v: int) -> PairErrors:
-        """Localize u and v from each other."""
+    def errors(self, pairs: PairIndices) -> list[PairErrors]:
+        """Localize the images of each pair from each other."""
+        return [self._errors(u, v) for u, v in pairs.tolist()]
+
+    def _errors(self, u: int, v: int) -> PairErrors:
         points_u, pixels_u = self._seen(u)
         points_v, pixels_v = self._seen(v)
         common, rows_u, rows_v = np.intersect1d(points_u, points_v, return_indices=True)
@@ -321,15 +329,28 @@ class LocalizeEdges:
         choose = all_pairs if self._options.candidates == "all" else likely_pairs
         return choose(self._references.map)
 
-    def errors(self, u: int, v: int) -> PairErrors:
-        """Localize u and v from each other."""
-        return PairErrors(v_from_u=self.error(u, v), u_from_v=self.error(v, u))
+    def errors(self, pairs: PairIndices) -> list[PairErrors]:
+        """Localize the images of each pair from each other."""
+        found = self.errors_of(_both_ways(pairs))
+        return [PairErrors(v_from_u=a, u_from_v=b) for a, b in zip(found[::2], found[1::2], strict=True)]
 
-    def error(self, reference: int, query: int) -> float:
-        """Relative corner error of the query's pose, estimated from the reference alone."""
-        seen = self._query(query)
-        matches = self._matching.match(seen, reference, None)
-        return self._references.error(query, matches.pixels(seen), matches.points)
+    def errors_of(self, directed: Sequence[tuple[int, int]]) -> list[float]:
+        """Relative corner error of the query's pose, estimated from the reference alone.
+
+        Args:
+            directed: Indices of a reference and a query each.
+        """
+        found: list[float] = []
+        for start in range(0, len(directed), _TOGETHER):
+            some = directed[start : start + _TOGETHER]
+            seen = [(self._query(query), reference) for reference, query in some]
+            found += [
+                self._references.error(index, matches.pixels(query), matches.points)
+                for (_, index), (query, _), matches in zip(
+                    some, seen, self._matching.match(seen, None), strict=True
+                )
+            ]
+        return found
 
     def _read(self, index: int) -> Query:
         map_, name = self._references.map, self._references.names[index]
@@ -342,6 +363,11 @@ class LocalizeEdges:
             image=map_.photos.get(name),
             shrink_factor=map_.shrink_factor(name),
         )
+
+
+def _both_ways(pairs: PairIndices) -> list[tuple[int, int]]:
+    """A reference and a query for each pair and direction: v from u, then u from v."""
+    return [one for u, v in pairs.tolist() for one in ((u, v), (v, u))]
 
 
 class HybridEdges:
@@ -364,16 +390,16 @@ class HybridEdges:
         covisible = covisible_pairs(self._map, _MIN_COMMON_POINTS)
         return np.unique(np.concatenate([self._matches.pairs(), covisible]), axis=0)
 
-    def errors(self, u: int, v: int) -> PairErrors:
-        """Localize u and v from each other."""
-        if (min(u, v), max(u, v)) not in self._matched:
-            return self._localize.errors(u, v)
-        found = self._matches.errors(u, v)
-        v_from_u, u_from_v = found.v_from_u, found.u_from_v
-        return PairErrors(
-            v_from_u=v_from_u if self._is_decided(v_from_u) else self._localize.error(u, v),
-            u_from_v=u_from_v if self._is_decided(u_from_v) else self._localize.error(v, u),
-        )
+    def errors(self, pairs: PairIndices) -> list[PairErrors]:
+        """Localize the images of each pair from each other."""
+        matched = [(u, v) for u, v in pairs.tolist() if (min(u, v), max(u, v)) in self._matched]
+        by_matches = self._matches.errors(np.array(matched, np.int64).reshape(-1, 2))
+        known: dict[tuple[int, int], float] = {}  # by reference and query
+        for (u, v), one in zip(matched, by_matches, strict=True):
+            known[u, v], known[v, u] = one.v_from_u, one.u_from_v
+        left = [one for one in _both_ways(pairs) if one not in known or not self._is_decided(known[one])]
+        known |= dict(zip(left, self._localize.errors_of(left), strict=True))
+        return [PairErrors(v_from_u=known[u, v], u_from_v=known[v, u]) for u, v in pairs.tolist()]
 
     def _is_decided(self, error: float) -> bool:
         threshold = self._options.threshold

@@ -1,5 +1,6 @@
 """Match a query with one reference image, or with points near where they project."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil
@@ -17,6 +18,7 @@ from slimsfm.features import (
     Matcher,
     NearestOptions,
     load_matcher,
+    match_many,
     match_nearest,
     shrink_factor,
     unit_rows,
@@ -31,13 +33,13 @@ from slimsfm.mapping.map import Map
 class ReferenceMatching(Protocol):
     """Matches queries with the reference images of one map, which are numbered in order of name."""
 
-    def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:
-        """Match a query with an image.
+    def match(self, pairs: Sequence[tuple[Query, int]], strongest: int | None) -> list[PointMatches]:
+        """Match queries with images.
 
         Args:
-            query: The query.
-            row: The image.
-            strongest: Match only this many of the query's strongest keypoints, if the matcher matches
+            pairs: A query and an image each; all that are known together, because a network matches several
+                pairs at once sooner than one after the other.
+            strongest: Match only this many of a query's strongest keypoints, if the matcher matches
                 keypoints one by one; None for all.
         """
         ...
@@ -98,9 +100,12 @@ class NearestMatching:
         for row in range(len(names) if cached is None else 0):
             self._target(row)  # read now, not for the first query
 
-    def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:
-        """Match a query's descriptors with those of an image."""
-        return match_target(query.descriptors[:strongest], self._target(row), self._options, references=1)
+    def match(self, pairs: Sequence[tuple[Query, int]], strongest: int | None) -> list[PointMatches]:
+        """Match the queries' descriptors with those of images."""
+        return [
+            match_target(query.descriptors[:strongest], self._target(row), self._options, references=1)
+            for query, row in pairs
+        ]
 
     def target(self, row: int) -> Target:
         """Descriptors and points that the image sees."""
@@ -122,10 +127,13 @@ class PairMatching:
         for row in range(len(names) if cached is None else 0):
             self._seeing(row)  # read now, not for the first query
 
-    def match(self, query: Query, row: int, strongest: int | None) -> PointMatches:  # noqa: ARG002
-        """Match all of a query's features with those of an image."""
-        pairs = self._matcher.match(query.features, self._seeing(row))
-        return PointMatches(keypoints=pairs[:, 0], points=self._points[row][pairs[:, 1]], references=1)
+    def match(self, pairs: Sequence[tuple[Query, int]], strongest: int | None) -> list[PointMatches]:  # noqa: ARG002
+        """Match all of the queries' features with those of images."""
+        found = match_many(self._matcher, [(query.features, self._seeing(row)) for query, row in pairs])
+        return [
+            PointMatches(keypoints=one[:, 0], points=self._points[row][one[:, 1]], references=1)
+            for one, (_, row) in zip(found, pairs, strict=True)
+        ]
 
     def target(self, row: int) -> Target:
         """Descriptors and points that the image sees."""

@@ -99,8 +99,14 @@ class ReferenceImages:
             strongest: Match only this many of the query's strongest keypoints, if the matcher matches
                 keypoints one by one.
         """
+        return unite(self.match_each(query, rows, strongest), query.shrink_factor)
+
+    def match_each(
+        self, query: Query, rows: Sequence[int] | None = None, strongest: int | None = None
+    ) -> list[PointMatches]:
+        """Match as `match` does, but return the matches with each image by themselves."""
         chosen = range(len(self)) if rows is None else rows
-        return unite([self._matching.match(query, row, strongest) for row in chosen], query.shrink_factor)
+        return self._matching.match([(query, row) for row in chosen], strongest)
 
     def describe(self, query: Query) -> Descriptors:
         """Local descriptors of a query, of the kind that the images' global descriptors are made from."""
@@ -236,9 +242,11 @@ class Progressive:
         similarities, tried = self._ranking.similarities(self.references.describe(query)), []
         while len(tried) < _TRIED * len(self.references):
             agreeing = matches.points[pose.inliers] if pose else matches.points
-            for _ in range(max(1, round(_GROWTH * len(tried)))):
+            known = len(tried)
+            for _ in range(max(1, round(_GROWTH * known))):
                 tried.append(self._next(similarities, tried, agreeing))
-                parts.append(self.references.match(query, tried[-1:], _STRONGEST))
+            found = self.references.match_each(query, tried[known:], _STRONGEST)
+            parts += [unite([one], query.shrink_factor) for one in found]
             matches = unite(parts, query.shrink_factor)
             pose = yield matches
         yield self.references.match(query)

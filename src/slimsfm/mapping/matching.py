@@ -11,7 +11,7 @@ import pycolmap
 from threadpoolctl import threadpool_limits
 
 from slimsfm.arrays import Descriptors, IndexPairs, Points2D
-from slimsfm.features import Features, Matcher, match_nearest, unit_rows
+from slimsfm.features import Features, Matcher, match_many, match_nearest, unit_rows
 from slimsfm.features.store import FeatureFile
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.orientation import turned_features
@@ -81,8 +81,9 @@ def match_and_verify(
 ) -> Geometries:
     """Match pairs of images and verify the matches, without what an interrupted build did.
 
-    The result for a pair depends on nothing but the pair, so blocks and workers change no bit of it. Pairs
-    without a verified match are omitted.
+    The result for a pair depends on nothing but the pair, so blocks and workers change no bit of it, except
+    that networks round differently for other pairs in a batch on a GPU. Pairs without a verified match are
+    omitted.
 
     Args:
         matching: How to match and verify.
@@ -121,14 +122,19 @@ def _solve(block: _Block) -> Arrays:
     views = lru_cache(lambda name: _view(matching, name, read(name)))
     largest = lru_cache(lambda name: _largest(read(name)))
 
-    def solve(a: str, b: str) -> pycolmap.TwoViewGeometry:
-        if (a, b) in block.unsure and len(match_nearest(largest(a), largest(b))) < _ALIKE:
+    def may_match(a: str, b: str) -> bool:
+        return (a, b) not in block.unsure or len(match_nearest(largest(a), largest(b))) >= _ALIKE
+
+    def verified(a: str, b: str, matches: IndexPairs | None) -> pycolmap.TwoViewGeometry:
+        if matches is None:
             return pycolmap.TwoViewGeometry()
-        matches = matching.matcher.match(read(a), read(b))
         return verify(views(a), views(b), matches, seed=matching.seed)
 
     with threadpool_limits(1) if matching.one_thread else nullcontext():
-        return _packed([solve(a, b) for a, b in block.pairs])
+        likely = [(a, b) for a, b in block.pairs if may_match(a, b)]
+        found = match_many(matching.matcher, [(read(a), read(b)) for a, b in likely])
+        matches = dict(zip(likely, found, strict=True))
+        return _packed([verified(a, b, matches.get((a, b))) for a, b in block.pairs])
 
 
 def _largest(features: Features) -> Descriptors:

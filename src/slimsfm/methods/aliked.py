@@ -22,7 +22,8 @@ from torch import Tensor, nn
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
-from slimsfm.methods.tensors import check_sizes, features_of, network_input
+from slimsfm.methods.keypoints import check_sizes
+from slimsfm.methods.tensors import features_of, network_input
 from slimsfm.networks.loading import choose_device, inference, load_network
 from slimsfm.networks.onnx import Exportable, Run, onnx_run
 

@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812
-from jaxtyping import Float
 from kornia.feature import LightGlue as Network
-from kornia.feature.lightglue import CrossBlock
 from torch import Tensor, nn
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.errors import InputError
 from slimsfm.features.base import Features, unit_rows
+from slimsfm.networks.batches import OnDevice, in_batches
+from slimsfm.networks.lightglue import given_to, match_batch, with_fused_attention
 from slimsfm.networks.loading import choose_device, inference, load_network
-from slimsfm.networks.onnx import Exportable, onnx_run
+from slimsfm.networks.onnx import Exportable, Run, onnx_run
 
 KNOWN = ("aliked", "disk", "sift", "superpoint")
 """Extractors with trained weights."""
@@ -33,33 +32,47 @@ class LightGlue:
         """Create a matcher for the features of an extractor, one of `KNOWN`."""
         if features not in KNOWN:
             raise ValueError(f"features must be of one of {', '.join(KNOWN)}, got {features!r}")
-        self._features = features
+        self._features, self._weights = features, f"lightglue-{features}"
 
     @cached_property
     def network(self) -> Network:
         """The network with its trained weights."""
-        made, weights = network_for(self._features), f"lightglue-{self._features}"
-        loaded = load_network(made, weights, lightglue_state, derived={"confidence_thresholds"})
-        for layer in loaded.transformers:
-            layer.cross_attn = CrossAttention(layer.cross_attn)  # pyright: ignore[reportArgumentType]
-        return loaded
+        made, derived = network_for(self._features), {"confidence_thresholds"}
+        loaded = load_network(made, self._weights, lightglue_state, derived)
+        return with_fused_attention(loaded)
 
     def match(self, features1: Features, features2: Features) -> IndexPairs:
         """Match two images. Each feature occurs at most once; pairs are sorted by the first feature.
 
         The network stops early and prunes unmatched keypoints; its ONNX export runs all layers.
         """
-        if not len(features1) or not len(features2):
-            return np.zeros((0, 2), np.int64)
+        return self.match_many([(features1, features2)])[0]
+
+    def match_many(self, pairs: Sequence[tuple[Features, Features]]) -> list[IndexPairs]:
+        """Match pairs of images, on a GPU many at once; equal to `match` of each up to rounding.
+
+        Raises:
+            InputError: The GPU has not enough memory for a pair, or SIFT features lack what they need.
+        """
         device = choose_device()
-        run = onnx_run(f"lightglue-{self._features}")
-        given1, given2 = self._input(features1, device), self._input(features2, device)
-        with torch.inference_mode(), inference(device):
-            if run:
-                matches = run(*given1.values(), *given2.values())[0]
-            else:
-                matches = self.network({"image0": given1, "image1": given2})["matches0"]
-        columns = matches[0].cpu().numpy().astype(np.int64)
+        run = onnx_run(self._weights)
+
+        def solve(batch: Sequence[tuple[Features, Features]]) -> list[IndexPairs]:
+            with torch.inference_mode(), inference(device):
+                if run:
+                    return [self._by_onnx(run, one, other) for one, other in batch]
+                given = [(self._given(one, device), self._given(other, device)) for one, other in batch]
+                return match_batch(self.network, given)
+
+        return in_batches(solve, pairs, device)
+
+    @cached_property
+    def _given(self) -> OnDevice[Features]:
+        return OnDevice(lambda features, device: given_to(self.network, self._input(features, device)))
+
+    def _by_onnx(self, run: Run, features1: Features, features2: Features) -> IndexPairs:
+        both = [self._input(features, torch.device("cpu")).values() for features in (features1, features2)]
+        columns = run(*(value[None] for values in both for value in values))[0][0].numpy().astype(np.int64)
         rows = np.flatnonzero(columns >= 0)
         return np.stack([rows, columns[rows]], axis=1)
 
@@ -76,40 +89,7 @@ class LightGlue:
                     "build or import the map again, or use the matcher nearest"
                 )
             given["scales"], given["oris"] = features.frames.T
-        return {
-            key: torch.from_numpy(np.ascontiguousarray(value)).to(device)[None]
-            for key, value in given.items()
-        }
-
-
-class CrossAttention(nn.Module):
-    """Cross-attention between two images without a table of all pairs of keypoints.
-
-    Equal to kornia's layer up to rounding, and faster with many keypoints.
-    """
-
-    def __init__(self, layer: CrossBlock) -> None:
-        """Share the weights of kornia's layer."""
-        super().__init__()
-        self.layer = layer
-
-    def forward(
-        self, one: Float[Tensor, "1 n d"], other: Float[Tensor, "1 m d"]
-    ) -> tuple[Float[Tensor, "1 n d"], Float[Tensor, "1 m d"]]:
-        """Update the keypoints of each image by attention to those of the other."""
-        (keys1, values1), (keys2, values2) = self._heads(one), self._heads(other)
-        seen1 = F.scaled_dot_product_attention(keys1, keys2, values2)
-        seen2 = F.scaled_dot_product_attention(keys2, keys1, values1)
-        return self._changed(one, seen1), self._changed(other, seen2)
-
-    def _heads(self, features: Tensor) -> tuple[Tensor, ...]:
-        """Keys, which are also the queries, and values: (1, heads, n, d / heads)."""
-        both = self.layer.to_qk(features), self.layer.to_v(features)
-        return tuple(one.unflatten(-1, (self.layer.heads, -1)).transpose(1, 2) for one in both)
-
-    def _changed(self, features: Tensor, seen: Tensor) -> Tensor:
-        message = self.layer.to_out(seen.transpose(1, 2).flatten(start_dim=2))
-        return features + self.layer.ffn(torch.cat([features, message], dim=-1))
+        return {key: torch.from_numpy(np.ascontiguousarray(value)).to(device) for key, value in given.items()}
 
 
 class _WithoutStops(nn.Module):
@@ -129,7 +109,11 @@ class _WithoutStops(nn.Module):
 
 def exportable(method: str) -> Exportable:
     """The whole network: from the keypoints of two images to the match of each of the first, or -1."""
-    network = LightGlue(method.removeprefix("lightglue-")).network.cpu()
+    return exportable_network(LightGlue(method.removeprefix("lightglue-")).network.cpu())
+
+
+def exportable_network(network: Network) -> Exportable:
+    """The whole of a network with weights, on the CPU."""
     given = [_example(network, count) for count in (24, 32)]
     inputs = {f"{name}{i + 1}": value for i, one in enumerate(given) for name, value in one.items()}
     return Exportable(
@@ -158,9 +142,15 @@ def network_for(features: str) -> Network:
 
 
 def lightglue_state(checkpoint: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert the authors' state dict, which numbers layers per kind, to that of kornia."""
+    """Convert the authors' state dict, which numbers layers per kind, to that of kornia.
+
+    The file of LighterGlue also holds XFeat, and that for DISK values `r` that the network has no use for.
+    """
     state = {}
     for key, value in checkpoint.items():
+        if key.startswith("extractor.") or (key.startswith("log_assignment.") and key.endswith(".r")):
+            continue
+        key = key.removeprefix("matcher.")
         for kind in ("self_attn", "cross_attn"):
             if key.startswith(f"{kind}."):
                 _, layer, rest = key.split(".", 2)

@@ -8,7 +8,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from slimsfm.arrays import GrayImage, Image
-from slimsfm.features.base import Features, unmasked
+from slimsfm.features.base import Features
+from slimsfm.methods.keypoints import best_rows
 from slimsfm.photos import shrink
 
 
@@ -57,8 +58,7 @@ def features_of(
     """
     pixels = (_numpy(keypoints) + np.float32(0.5)) * taken.factors
     strength = _numpy(scores)
-    order = np.argsort(-strength, kind="stable")
-    order = order[unmasked(pixels, mask)[order]][:max_features]
+    order = best_rows(pixels, strength, mask, max_features)
     return Features(
         keypoints=pixels[order],
         descriptors=_numpy(descriptors)[order].astype(np.float16),
@@ -69,15 +69,3 @@ def features_of(
 
 def _numpy(values: Tensor) -> Float32[np.ndarray, "..."]:
     return values.detach().to("cpu", torch.float32).numpy()
-
-
-def check_sizes(max_features: int, max_image_size: int) -> None:
-    """Validate the limits of an extractor.
-
-    Raises:
-        ValueError: `max_features` is below 1 or `max_image_size` below 32.
-    """
-    if max_features < 1:
-        raise ValueError(f"max_features must be at least 1, got {max_features}")
-    if max_image_size < 32:
-        raise ValueError(f"max_image_size must be at least 32, got {max_image_size}")

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from slimsfm.errors import InputError
 from slimsfm.limits import check_bytes
-from slimsfm.weights import WEIGHTS, check_weights, current_runtime, find_weights, missing, remind_of_license
+from slimsfm.weight_files import WEIGHTS
+from slimsfm.weights import check_weights, current_runtime, find_weights, missing, remind_of_license
 
 
 def choose_device() -> torch.device:
@@ -52,15 +53,15 @@ def load_network(
 
     Args:
         network: An untrained network.
-        name: Key of `slimsfm.weights.WEIGHTS`.
+        name: Key of `slimsfm.weight_files.WEIGHTS`.
         state_of: Converts the contents of the file to the state dict of the network.
         derived: Values that the network computes itself and that may be missing in the file.
 
     Raises:
         InputError: The weights are missing, damaged, or of another network.
     """
-    path = find_weights(name) or _from_hub(name)
-    load_state(network, path, state_of, derived)
+    found = find_weights(name)
+    load_state(network, found.path if found else _from_hub(name), state_of, derived)
     remind_of_license(name)
     return network.to(choose_device()).eval().requires_grad_(False)
 

@@ -1,32 +1,29 @@
-"""Networks as ONNX files: written by PyTorch's exporter, run by onnxruntime on the CPU.
+"""Networks of PyTorch as ONNX files: writing them, and running them on tensors."""
 
-If the weights folder holds METHOD.onnx, the method runs it on the CPU. The file records its method and the
-checksum of its weights, and is refused if they do not match.
-"""
-
-import hashlib
 import logging
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from slimsfm.errors import InputError
-from slimsfm.networks.loading import choose_device
-from slimsfm.weights import WEIGHTS, current_runtime, find_weights, remind_of_license
+from slimsfm.networks.onnx_files import (
+    CHECKSUM,
+    METHOD,
+    ArrayRun,
+    import_for_onnx,
+    onnx_network,
+    weights_checksum,
+)
 
 Run = Callable[..., tuple[Tensor, ...]]
 """Takes the inputs of a network in order, and returns its outputs in order."""
 
-_METHOD, _WEIGHTS = "slimsfm.method", "slimsfm.weights"  # keys of the metadata in a file
 _NOISY = "torch.onnx", "torch.export", "onnxscript", "onnx_ir"  # loggers
 
 
@@ -63,14 +60,14 @@ def write_onnx(part: Exportable, method: str, path: Path) -> None:
 
     Args:
         part: The network to export.
-        method: Key of `slimsfm.weights.WEIGHTS`.
+        method: Key of `slimsfm.weight_files.WEIGHTS`.
         path: Path of the file.
 
     Raises:
         InputError: A package for writing ONNX files is not installed.
     """
     for package in ("onnx", "onnxscript"):
-        _import(package)
+        import_for_onnx(package)
     free = torch.export.Dim.DYNAMIC
     axes = tuple(dict.fromkeys(part.dynamic.get(name, ()), free) for name in part.inputs)
     with _quiet():
@@ -87,80 +84,22 @@ def write_onnx(part: Exportable, method: str, path: Path) -> None:
         raise RuntimeError("torch.onnx.export returned nothing")
     for node in program.model.graph:
         node.metadata_props.clear()  # the stack trace of each node
-    program.model.metadata_props.update({_METHOD: method, _WEIGHTS: _checksum(method)})
+    program.model.metadata_props.update({METHOD: method, CHECKSUM: weights_checksum(method)})
     program.save(path)
 
 
 def onnx_run(method: str) -> Run | None:
-    """Load METHOD.onnx from the weights folder; None if there is no such file, or networks run on a GPU.
-
-    Args:
-        method: Key of `slimsfm.weights.WEIGHTS`.
-
-    Raises:
-        InputError: The file is damaged or belongs to another method or to other weights than those in the
-            folder, or onnxruntime is not installed.
-    """
-    folder = current_runtime().weights
-    path = folder / f"{method}.onnx" if folder else None
-    if path is None or not path.is_file() or choose_device().type != "cpu":
-        return None
-    stat = path.stat()
-    return _load(path, method, torch.get_num_threads(), stat.st_size, stat.st_mtime_ns)
+    """Load METHOD.onnx from the weights folder, for tensors; see `onnx_files.onnx_network`."""
+    network = onnx_network(method)
+    return _for_tensors(network) if network else None
 
 
 @lru_cache(maxsize=8)
-def _load(path: Path, method: str, threads: int, _size: int, _changed: int) -> Run:
-    onnxruntime = _import("onnxruntime")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3  # errors
-    # Spinning threads would take the cores from PyTorch, which runs the rest of the method.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    try:
-        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # damaged files raise all kinds of exceptions
-        reason = str(error).partition("\n")[0]
-        raise InputError(f"{path}: onnxruntime cannot read it ({reason}); {_remedy(method)}") from error
-    _check_origin(path, method, session.get_modelmeta().custom_metadata_map)
-    remind_of_license(method)
-    names = [one.name for one in session.get_inputs()]
-
+def _for_tensors(network: ArrayRun) -> Run:
     def run(*inputs: Tensor) -> tuple[Tensor, ...]:
-        arrays = (np.ascontiguousarray(one.numpy()) for one in inputs)
-        found = session.run(None, dict(zip(names, arrays, strict=True)))
-        return tuple(torch.from_numpy(one) for one in found)
+        return tuple(torch.from_numpy(one) for one in network(*(one.numpy() for one in inputs)))
 
     return run
-
-
-def _check_origin(path: Path, method: str, origin: dict[str, str]) -> None:
-    if origin.get(_METHOD) != method:
-        raise InputError(f"{path}: was not written by slimsfm export onnx {method}; {_remedy(method)}")
-    here = _checksum(method)
-    if here and origin.get(_WEIGHTS) and here != origin[_WEIGHTS]:
-        raise InputError(
-            f"{path}: was exported from other weights than {WEIGHTS[method].file}; {_remedy(method)}"
-        )
-
-
-def _remedy(method: str) -> str:
-    return f"remove it, or export it again with slimsfm export onnx {method}"
-
-
-def _checksum(method: str) -> str:
-    """Checksum of the weight file in the weights folder; empty if it is not there."""
-    path = find_weights(method)
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path else ""
-
-
-def _import(package: str) -> Any:
-    try:
-        return import_module(package)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"ONNX files need {error.name}, which is not installed: pip install 'slimsfm[onnx]'"
-        ) from error
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """The extractor of maps without keypoints: it matches images as a whole and builds their model."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -67,12 +67,15 @@ class DetectorFreeMatching:
         self._reference = lru_cache(_CACHED)(self._read)
         self._last: tuple[Photo, EncodedImage] | None = None
 
-    def match(self, query: Query, row: int, strongest: int | None = None) -> PointMatches:  # noqa: ARG002
-        """Match a query with a reference photo.
+    def match(self, pairs: Sequence[tuple[Query, int]], strongest: int | None) -> list[PointMatches]:  # noqa: ARG002
+        """Match queries with reference photos.
 
         Raises:
-            InputError: The query has no image.
+            InputError: A query has no image.
         """
+        return [self._match(query, row) for query, row in pairs]
+
+    def _match(self, query: Query, row: int) -> PointMatches:
         seen, reference = self._encoded(query), self._reference(row)
         cells = self._matcher.match_cells(reference.encoded, seen)
         if not len(cells) or not len(reference.points):

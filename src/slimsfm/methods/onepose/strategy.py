@@ -176,7 +176,7 @@ class ObjectFinder:
         return locate_object(self._vote(query, view) for view in self._views)
 
     def _vote(self, query: Query, view: ObjectView) -> RegionVote | None:
-        matches = self._matching.match(query, view.row, None)
+        matches = self._matching.match([(query, view.row)], None)[0]
         kept = np.flatnonzero(np.isin(matches.points, view.points))
         pixels = view.points2D[np.searchsorted(view.points, matches.points[kept])]
         size = query.camera.width, query.camera.height

@@ -40,7 +40,7 @@ from slimsfm.methods.onepose.crop import (
 from slimsfm.methods.onepose.points import OnePosePoints, OnePosePointsOptions, prepare_points
 from slimsfm.methods.onepose_plus.network import CoarseToFine, OnePosePlusMatcher
 from slimsfm.networks.loading import choose_device, inference, load_network, matcher_state
-from slimsfm.weights import WEIGHTS
+from slimsfm.weight_files import WEIGHTS
 
 _POINTS = OnePosePointsOptions(max_points=15000, leaves=0)  # as in the authors' code
 _COARSE, _FINE = 256, 128  # dimensions of the two parts of a descriptor
