@@ -11,8 +11,8 @@ uses quantities that are rarely good for a wrong pose:
                 this one
     found       share of the points that should be visible that have a similar keypoint where they project,
                 and no equally similar one elsewhere
-    intrinsics  the corner error that a wrong camera could cause without being noticed, unless the camera was
-                given with the query, and how much the matches contradict the camera
+    intrinsics  the corner error that a wrong camera could cause without being noticed, and how much the
+                matches contradict the camera
     spread      number of squares of the image with inliers
 
 Their weighted sum is the log-odds that the pose is right. The weights come from logistic regression on
@@ -23,6 +23,9 @@ No confidence exceeds the probability, by the covariance of the pose, that its c
 all of its inliers are right. That is of the covariance before its inflation for the 95 % bounds, which most
 errors do not nearly reach; where the predicted error, which includes it, is above 0.1, the confidence is at
 most 0.9, so that the pose is never sure.
+
+Where only the unproven camera is against a pose, but was given with the query and is not contradicted, the
+confidence is what it would be if matches proved the camera, though at most 0.7.
 
 This holds on right maps. Next to images that the map's own matches contradict, because the map may be folded
 there, 60 % of the confidence remains.
@@ -54,6 +57,7 @@ UNAMBIGUOUS = 0.75
 _DOUBTED = 0.6  # of the confidence, next to contradicted images
 _DETERMINED = 0.02  # predicted error up to which one of 0.1 would be five standard deviations
 _UNPROVEN = 0.1  # largest corner error by wrong intrinsics that counts against the matches themselves
+_GIVEN = 0.7  # most, where only the user says what the intrinsics are: given ones are wrong at times
 _VAGUE = 0.9  # most, where the predicted error is above that of a right pose
 _BEHIND = 0.02  # of the confidence, where most points are seen from behind: a mirrored photo of a plane is
 _LEAST_FACING = 0.5  # share of the points that must be seen from the side they were seen from
@@ -124,7 +128,10 @@ class Evidence:
     @property
     def confidence(self) -> float:
         """Probability that the pose is right."""
-        learned = float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ self.terms, -50, 50))))
+        learned = _probability(self.terms)
+        if self.calibrated and self.misfit < 1 and self.uncalibrated_error > _UNPROVEN:
+            proven = _probability(replace(self, uncalibrated_error=_UNPROVEN).terms)
+            learned = max(learned, min(proven, _GIVEN))
         is_vague = self.predicted_error > ADD_FRACTIONS[0]
         on_right_map = min(learned, self.determined, _VAGUE if is_vague else 1.0)
         if self.is_behind:
@@ -139,13 +146,6 @@ class Evidence:
         """
         provable = max(min(self.uncalibrated_error, _UNPROVEN), self.uncalibrated_error / 2)
         return replace(self, uncalibrated_error=provable).confidence
-
-    @property
-    def _unproven_error(self) -> float:
-        """The error by wrong intrinsics that counts: given ones need no proof unless contradicted."""
-        if self.calibrated and self.misfit < 1:
-            return min(self.uncalibrated_error, _UNPROVEN)
-        return self.uncalibrated_error
 
     @property
     def is_behind(self) -> bool:
@@ -170,11 +170,15 @@ class Evidence:
                 -min(self.rival / self.inliers, 1.0),
                 self.found,
                 -np.log(np.clip(self.predicted_error, 0.04, 1.0) / 0.04),
-                -np.log(np.clip(self._unproven_error, 0.02, 1.0) / 0.1),
+                -np.log(np.clip(self.uncalibrated_error, 0.02, 1.0) / 0.1),
                 -min(self.misfit, 1.0),
                 np.log(np.clip(self.cells, 1, 30) / 10),
             ]
         )
+
+
+def _probability(terms: Float64[np.ndarray, " terms"]) -> float:
+    return float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ terms, -50, 50))))
 
 
 class Verifier:
