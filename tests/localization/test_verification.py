@@ -57,10 +57,10 @@ def test_there_is_a_weight_per_term_and_none_is_negative():
 def test_given_intrinsics_need_no_proof_for_a_fair_confidence_unless_matches_contradict_them():
     given = replace(GOOD, calibrated=True)
     assert given.confidence == GOOD.confidence > 0.9
-    weak = {"distinct": 20, "inliers": 25, "uncalibrated_error": 0.5}
+    weak = {"distinct": 12, "inliers": 20, "matched": 60, "found": 0.3, "uncalibrated_error": 0.5}
     unproven = [replace(one, **weak).confidence for one in (given, GOOD)]
     assert 0.5 < unproven[0] <= 0.7
-    assert unproven[0] > unproven[1] + 0.1
+    assert unproven[0] > unproven[1] + 0.05
     contradicted = [replace(one, **weak, misfit=1.0).confidence for one in (given, GOOD)]
     assert contradicted[0] == contradicted[1]
 
