@@ -91,7 +91,7 @@ def examples_of(scene: MappedScene, scenes: Sequence[MappedScene], every: int) -
         "progressive, full": (scene.full, LocalizationOptions(strategy="progressive")),
         "direct, slim": (scene.slim, LocalizationOptions(strategy="direct")),
     }
-    queries = list(examples(scene, scenes))[::every]
+    queries = list(examples(scene, scenes, every=every))
     for method, (map_, options) in methods.items():
         localizer = Localizer(map_, options)
         for query in shown(queries, f"{scene.name} ({method})"):
