@@ -161,7 +161,7 @@ def _read(kept: Path) -> tuple[Features, pycolmap.Camera, bool]:
             descriptors=stored["descriptors"],
             scores=stored["scores"],
             image_size=(width, height),
-            frames=stored["frames"] if "frames" in stored else None,
+            frames=stored.get("frames"),
         )
         camera = pycolmap.Camera(
             model=str(stored["model"]), width=width, height=height, params=stored["params"].tolist()
