@@ -10,7 +10,7 @@ from jaxtyping import Float64
 EVIDENCE_WEIGHTS = {
     "aliked": np.array([1.52, 0.17, 0.51, 0.12, 0.74, 1.04, 0.79, 0.19, 1.33, 3.05, 0.4]),
     "sift": np.array([2.87, 0.18, 0.27, 0.17, 0.99, 1.01, 0.96, 0.26, 1.36, 3.16, 0.09]),
-    "xfeat": np.array([1.83, 0.27, 0.59, 0.46, 0.81, 1.03, 1.05, 0.3, 1.13, 2.99, 0.06]),
+    "xfeat": np.array([1.66, 0.32, 0.54, 0.4, 0.57, 0.97, 1.04, 0.29, 0.86, 2.77, 0.14]),
 }
 """Weights of `Evidence.terms` by extractor; other extractors use SIFT's."""
 

@@ -15,10 +15,11 @@ uses quantities that are rarely good for a wrong pose:
                 given with the query, and how much the matches contradict the camera
     spread      number of squares of the image with inliers
 
-Their weighted sum is the log-odds that the pose is right. The weights, by extractor in
-`calibration`, come from logistic regression on rendered and photographed scenes, whose queries are zoomed,
-cropped, blurred, dark, hidden, mirrored, or of another scene; signs are constrained to the plausible ones.
-`benchmarks/confidence.py` learns the weights and measures the calibration on held-out scenes. A pose that sees the surface from behind is not believed at all.
+Their weighted sum is the log-odds that the pose is right. The weights, by extractor in `calibration`, come
+from logistic regression on rendered and photographed scenes, whose queries are zoomed, cropped, blurred,
+dark, hidden, mirrored, or of another scene; signs are constrained to the plausible ones.
+`benchmarks/confidence.py` learns the weights and measures the calibration on held-out scenes. A pose that
+sees the surface from behind is not believed at all.
 No confidence exceeds the probability, by the covariance of the pose, that its corner error is below 0.1 if
 all of its inliers are right. That is of the covariance before its inflation for the 95 % bounds, which most
 errors do not nearly reach; where the predicted error, which includes it, is above 0.1, the confidence is at
