@@ -67,7 +67,7 @@ class DisturbedQuery:
 
 
 def examples(
-    scene: MappedScene, others: Sequence[MappedScene] = (), *, queries: int = QUERIES
+    scene: MappedScene, others: Sequence[MappedScene] = (), *, queries: int = QUERIES, every: int = 1
 ) -> Iterator[DisturbedQuery]:
     """Every disturbance of some queries of a scene, then clean queries of other scenes.
 
@@ -75,14 +75,18 @@ def examples(
         scene: The scene.
         others: Scenes whose queries have no pose in this one; the scene itself is left out.
         queries: Number of queries per scene, spread evenly.
+        every: 2: only every second one of all of these.
     """
-    for disturbance in DISTURBANCES:
-        for query in spread(scene.queries, queries):
-            yield disturbed(scene, query, disturbance)
-    for other in others:
-        if other.name != scene.name:
-            for query in spread(other.queries, queries):
-                yield of_other(scene.name, disturbed(other, query, "clean"))
+    own = [(scene, query, name) for name in DISTURBANCES for query in spread(scene.queries, queries)]
+    strange = [
+        (other, query, "clean")
+        for other in others
+        if other.name != scene.name
+        for query in spread(other.queries, queries)
+    ]
+    for owner, query, name in (own + strange)[::every]:
+        made = disturbed(owner, query, name)
+        yield made if owner is scene else of_other(scene.name, made)
 
 
 def spread(queries: Sequence[PosedQuery], count: int) -> list[PosedQuery]:
@@ -136,6 +140,7 @@ def _prepare(scene: MappedScene, query: PosedQuery, disturbance: Disturbance, ke
     arrays = {
         field: getattr(features, field)
         for field in ("keypoints", "descriptors", "scores", "image_size", "frames")
+        if getattr(features, field) is not None
     }
     np.savez(
         kept,
@@ -156,7 +161,7 @@ def _read(kept: Path) -> tuple[Features, pycolmap.Camera, bool]:
             descriptors=stored["descriptors"],
             scores=stored["scores"],
             image_size=(width, height),
-            frames=stored["frames"],
+            frames=stored.get("frames"),
         )
         camera = pycolmap.Camera(
             model=str(stored["model"]), width=width, height=height, params=stored["params"].tolist()

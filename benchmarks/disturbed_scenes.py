@@ -1,6 +1,7 @@
 """Scenes of disturbed queries, each with a full and a slim map: photos, rendered objects, and a flat scene.
 
-Everything is stored in the output folder and made once.
+Everything is stored in the output folder and made once. True poses of photos are those of a SIFT map of all
+of them; the maps of another extractor are triangulated from these poses.
 """
 
 import json
@@ -21,6 +22,7 @@ from slimsfm.evaluation.results import PosedQuery, queries_of
 from slimsfm.files import replacing
 from slimsfm.geometry import Box
 from slimsfm.mapping import Map, read_map, write_map
+from slimsfm.mapping.build import BuildOptions
 from slimsfm.mapping.model import estimate_box
 from slimsfm.progress import shown
 from slimsfm.reduction import reduce
@@ -61,19 +63,21 @@ class MappedScene:
     """Folder for everything that is stored of the scene."""
 
 
-def mapped_scene(name: str, photos: Path, output: Path) -> MappedScene:
+def mapped_scene(name: str, photos: Path, output: Path, extractor: str = "sift") -> MappedScene:
     """One scene; existing files in the output folder are reused.
 
     Args:
         name: One of `NAMES`.
         photos: Folder with the folders of photos.
         output: Folder for maps and renderings.
+        extractor: Name of the extractor of the maps; other ones than SIFT have their own folder for them.
     """
+    folder = output if extractor == "sift" else output / extractor
     with quiet():
         made = sequences(name, photos, output)
-        full, slim = output / f"{name}-map", output / f"{name}-slim"
+        full, slim = folder / f"{name}-map", folder / f"{name}-slim"
         if not full.exists():
-            write_map(_mapped(name, made), full)
+            write_map(_mapped(name, made, BuildOptions(extractor=extractor)), full)
         if not slim.exists():
             write_map(reduce(read_map(full)).map, slim)
     return MappedScene(
@@ -81,7 +85,7 @@ def mapped_scene(name: str, photos: Path, output: Path) -> MappedScene:
         full=read_map(full),
         slim=read_map(slim),
         queries=queries_of(made.query),
-        folder=output / "disturbed" / name,
+        folder=folder / "disturbed" / name,
     )
 
 
@@ -96,9 +100,9 @@ def sequences(name: str, photos: Path, output: Path) -> ObjectSequences:
     return Synthetic(path=output / "objects").load(name, LoadOptions(folder=output, progress=shown))
 
 
-def _mapped(name: str, made: ObjectSequences) -> Map:
+def _mapped(name: str, made: ObjectSequences, options: BuildOptions) -> Map:
     with tempfile.TemporaryDirectory() as workspace:
-        full = map_object(made, Path(workspace), progress=shown)
+        full = map_object(made, Path(workspace), options, progress=shown)
         if name == OFFICE:  # a room has no box of its own
             full = replace(full, info=replace(full.info, box=estimate_box(full.model)))
         write_map(full, Path(workspace) / "map")

@@ -16,8 +16,10 @@ from commands import contents, slimsfm
 from rendered import MAPPING_FRAMES, NAME, QUERY_FRAMES
 from slimsfm.cli import COMMANDS
 from slimsfm.domination import dominates
+from slimsfm.features import EXTRACTORS
 from slimsfm.geometry import corner_error
 from slimsfm.graph.compute import load_or_compute_graph
+from slimsfm.localization.calibration import CALIBRATED
 from slimsfm.mapping.io import read_map
 
 
@@ -70,6 +72,19 @@ def test_build_and_info(boulder, tmp_path):
     listed = slimsfm("info", tmp_path / "map", "--images").out
     assert all(name in listed for name in facts["images"])
     assert facts["images"][0] not in slimsfm("info", tmp_path / "map").out
+
+
+@pytest.mark.parametrize("extractor", [*EXTRACTORS, "of-a-plug-in"])
+def test_info_says_whose_confidence_is_not_calibrated(a_map, extractor):
+    stored = json.loads((a_map / "map.json").read_text())
+    stored["extractor"] = {"name": extractor, "options": {}}
+    del stored["checksums"]
+    (a_map / "map.json").write_text(json.dumps(stored))
+    said = " ".join(slimsfm("info", a_map).out.split())
+    assert f"extractor {extractor}" in said
+    assert ("confidence not calibrated for this extractor" in said) == (extractor not in CALIBRATED)
+    facts = json.loads(slimsfm("info", a_map, "--json").out)
+    assert facts["extractor"]["confidence_calibrated"] == (extractor in CALIBRATED)
 
 
 def test_info_says_what_kind_of_map_it_is(boulder, tmp_path):

@@ -1,12 +1,15 @@
 """Learned methods on the command line: what is found, what is missing, and that nothing else needs them."""
 
 import os
+import re
 import subprocess
 import sys
 
 import pytest
 
 from commands import messages, slimsfm
+from slimsfm.features.registry import EXTRACTORS, plugins
+from slimsfm.localization.calibration import CALIBRATED
 from slimsfm.weights import FOLDER
 
 WITHOUT = """
@@ -59,6 +62,12 @@ def test_methods_are_listed_with_licenses_and_found_weights(tmp_path):
     assert "research only" in lines["superpoint"]
     assert lines["disk"].rstrip().endswith("weights folder")
     assert "no: not the published file" in lines["aliked"]
+
+
+def test_methods_names_the_extractors_whose_confidence_is_not_calibrated():
+    said = " ".join(slimsfm("methods").out.split())
+    (named,) = re.findall(r"confidence not calibrated for these extractors: ([^,\s]+(?:, [^,\s]+)*)", said)
+    assert set(named.split(", ")) == {*EXTRACTORS, *plugins("extractor")} - CALIBRATED
 
 
 def test_classical_methods_need_no_network_stack(boulder, tmp_path):

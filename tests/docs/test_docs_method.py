@@ -11,7 +11,7 @@ from slimsfm.domination import exact, random_greedy
 from slimsfm.evaluation import scores
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions
-from slimsfm.localization import LocalizationOptions, round_result, verification
+from slimsfm.localization import LocalizationOptions, calibration, round_result, verification
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import DominatingSetOptions, forecast
 from slimsfm.selection import information, problem
@@ -26,7 +26,7 @@ def default(function, name: str) -> float:
 def test_the_weights_of_the_confidence_match_the_code():
     formula = PAGE[PAGE.index(r"\log \frac{c}{1 - c}") :].partition("$$")[0]
     constant, *rest = re.findall(r"[=+-] (\d\.\d+)", formula)
-    assert [float(one) for one in (constant, *rest)] == verification.EVIDENCE_WEIGHTS.tolist()
+    assert [float(one) for one in (constant, *rest)] == calibration.EVIDENCE_WEIGHTS["sift"].tolist()
 
 
 @pytest.mark.parametrize(

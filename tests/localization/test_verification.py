@@ -5,15 +5,16 @@ import pycolmap
 import pytest
 
 from scenes import camera, exact_map, poses
-from slimsfm.features import Features
+from slimsfm.features import EXTRACTORS, Features
 from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
+from slimsfm.localization.calibration import CALIBRATED, EVIDENCE_WEIGHTS, evidence_weights
 from slimsfm.localization.cameras import QueryCamera
 from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
 from slimsfm.localization.round_result import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.strategy import PointMatches, Query
-from slimsfm.localization.verification import EVIDENCE_WEIGHTS, Evidence
+from slimsfm.localization.verification import Evidence
 from slimsfm.mapping.map import GlobalDescriptors, observed
 from slimsfm.mapping.support import measure
 
@@ -49,9 +50,20 @@ def test_confidence_never_rises_as_evidence_gets_worse(name):
     assert all(0 < value < 1 for value in values)
 
 
-def test_there_is_a_weight_per_term_and_none_is_negative():
-    assert EVIDENCE_WEIGHTS.shape == GOOD.terms.shape
-    assert np.all(EVIDENCE_WEIGHTS[1:] >= 0)
+@pytest.mark.parametrize("extractor", EVIDENCE_WEIGHTS)
+def test_there_is_a_weight_per_term_and_none_is_negative(extractor):
+    assert EVIDENCE_WEIGHTS[extractor].shape == GOOD.terms.shape
+    assert np.all(EVIDENCE_WEIGHTS[extractor][1:] >= 0)
+
+
+def test_every_extractor_with_its_own_weights_is_calibrated_and_exists():
+    assert EVIDENCE_WEIGHTS.keys() <= CALIBRATED <= EXTRACTORS.keys()
+
+
+def test_an_extractor_without_its_own_weights_uses_those_of_sift():
+    for extractor in {*EXTRACTORS, "of a plug-in"} - EVIDENCE_WEIGHTS.keys():
+        assert evidence_weights(extractor) is EVIDENCE_WEIGHTS["sift"]
+        assert replace(GOOD, extractor=extractor).confidence == GOOD.confidence
 
 
 def test_given_intrinsics_need_no_proof_for_a_fair_confidence_unless_matches_contradict_them():

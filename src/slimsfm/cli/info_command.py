@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 from slimsfm.cli.options import MapPath
 from slimsfm.cli.output import console, counts, plural, print_notes, size
+from slimsfm.localization.calibration import CALIBRATED
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
 
@@ -29,7 +30,7 @@ def info(map: MapPath, /, json: bool = False, images: bool = False) -> None:
 
 
 def _facts(map: Map, sizes: dict[str, int]) -> dict:
-    box, parts = map.box, counts(map)
+    box, parts, info = map.box, counts(map), map.info
     return {
         "kind": map.kind,
         "images": list(map.images),
@@ -38,16 +39,20 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         "mean_track_length": round(map.model.compute_mean_track_length(), 3),
         "mean_reprojection_error_px": round(map.model.compute_mean_reprojection_error(), 4),
         "verified_pairs": len(map.matches),
-        "box": {"diagonal": box.diagonal, "source": map.info.box_source, "corners": box.corners.tolist()},
-        "unit": map.info.unit,
-        "extractor": {"name": map.info.extractor, "options": map.info.extractor_options},
-        "origin": map.info.origin,
-        "notes": list(map.info.notes),
-        "orientation": map.info.orientation,
-        "exif_orientations": {
-            name: tag for name, tag in map.info.exif_orientations.items() if name in map.images
+        "box": {"diagonal": box.diagonal, "source": info.box_source, "corners": box.corners.tolist()},
+        "unit": info.unit,
+        "extractor": {
+            "name": info.extractor,
+            "options": info.extractor_options,
+            "confidence_calibrated": info.extractor in CALIBRATED,
         },
-        "quality": asdict(map.info.quality) if map.info.quality else None,
+        "origin": info.origin,
+        "notes": list(info.notes),
+        "orientation": info.orientation,
+        "exif_orientations": {
+            name: tag for name, tag in info.exif_orientations.items() if name in map.images
+        },
+        "quality": asdict(info.quality) if info.quality else None,
         "bytes": sizes,
     }
 
@@ -64,6 +69,7 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
         )
     matches = f", {plural(len(map.matches), 'verified pair')}" if map.matches else ""
     options = ", ".join(f"{key} {value}" for key, value in info.extractor_options.items())
+    uncalibrated = "" if info.extractor in CALIBRATED else "; confidence not calibrated for this extractor"
     unit = "map units (unknown scale)" if info.unit == "unknown" else info.unit
     support = {"support": map.info.quality.summary} if map.info.quality else {}
     return {
@@ -72,7 +78,7 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
         "points": points,
         **support,
         "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
-        "extractor": info.extractor + (f" ({options})" if options else ""),
+        "extractor": info.extractor + (f" ({options})" if options else "") + uncalibrated,
         "pixels": _pixels(map),
         "size": ", ".join(f"{part} {size(number)}" for part, number in sizes.items()),
     }

@@ -10,7 +10,8 @@ from slimsfm.cli.arguments import Networks
 from slimsfm.cli.options import Advanced
 from slimsfm.cli.output import console
 from slimsfm.errors import InputError
-from slimsfm.features.registry import plugins
+from slimsfm.features.registry import EXTRACTORS, plugins
+from slimsfm.localization.calibration import CALIBRATED
 from slimsfm.weight_files import WEIGHTS
 from slimsfm.weights import cached_weights, current_runtime, find_weights
 
@@ -113,6 +114,10 @@ def methods(networks: Annotated[Networks, Advanced()] = Networks()) -> None:
         for name, path in sorted(plugins(kind).items()):
             table.add_row(kind, name, path, "its own", "", "", "plug-in")
     console.print(table)
+    if uncalibrated := sorted({*EXTRACTORS, *plugins("extractor")} - CALIBRATED):
+        console.print(
+            f"confidence not calibrated for these extractors: {', '.join(uncalibrated)}", style="dim"
+        )
     packages = " and ".join(sorted({one.package.name for one in WEIGHTS.values() if one.package}))
     console.print(
         f"weights are searched for in --weights or $SLIMSFM_WEIGHTS, then in the packages {packages}, "

@@ -15,10 +15,11 @@ uses quantities that are rarely good for a wrong pose:
                 matches contradict the camera
     spread      number of squares of the image with inliers
 
-Their weighted sum is the log-odds that the pose is right. The weights come from logistic regression on
-rendered and photographed scenes, whose queries are zoomed, cropped, blurred, dark, hidden, mirrored, or of
-another scene; signs are constrained to the plausible ones. `benchmarks/confidence.py` learns the weights and
-measures the calibration on held-out scenes. A pose that sees the surface from behind is not believed at all.
+Their weighted sum is the log-odds that the pose is right. The weights, by extractor in `calibration`, come
+from logistic regression on rendered and photographed scenes, whose queries are zoomed, cropped, blurred,
+dark, hidden, mirrored, or of another scene; signs are constrained to the plausible ones.
+`benchmarks/confidence.py` learns the weights and measures the calibration on held-out scenes. A pose that
+sees the surface from behind is not believed at all.
 No confidence exceeds the probability, by the covariance of the pose, that its corner error is below 0.1 if
 all of its inliers are right. That is of the covariance before its inflation for the 95 % bounds, which most
 errors do not nearly reach; where the predicted error, which includes it, is above 0.1, the confidence is at
@@ -39,14 +40,12 @@ from jaxtyping import Float64
 
 from slimsfm.arrays import Descriptors, Ids, Mask, Points2D, evenly_spaced
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
+from slimsfm.localization.calibration import evidence_weights
 from slimsfm.localization.point_descriptors import PointSizes, viewing_directions
 from slimsfm.localization.strategy import PointMatches, Query, Strategy
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import misfit
-
-EVIDENCE_WEIGHTS = np.array([2.87, 0.18, 0.27, 0.17, 0.99, 1.01, 0.96, 0.26, 1.36, 3.16, 0.09])
-"""Weights of `Evidence.terms`, learned by `benchmarks/confidence.py`."""
 
 RIVAL_RANSAC = RansacOptions(min_inliers=6, max_iterations=150)
 """How the best other pose is estimated: finds a pose that a third of the remaining matches agrees with."""
@@ -125,18 +124,31 @@ class Evidence:
     calibrated: bool = False
     """Whether the intrinsics were given with the query, not taken from the map or the photo's EXIF data."""
 
+    extractor: str = "sift"
+    """Name of the extractor of the features, by which the evidence is weighed."""
+
     @property
     def confidence(self) -> float:
         """Probability that the pose is right."""
-        learned = _probability(self.terms)
+        learned = self._learned
         if self.calibrated and self.misfit < 1 and self.uncalibrated_error > _UNPROVEN:
-            proven = _probability(replace(self, uncalibrated_error=_UNPROVEN).terms)
-            learned = max(learned, min(proven, _GIVEN))
-        is_vague = self.predicted_error > ADD_FRACTIONS[0]
-        on_right_map = min(learned, self.determined, _VAGUE if is_vague else 1.0)
+            proven = replace(self, uncalibrated_error=_UNPROVEN)
+            learned = max(learned, min(proven._learned, _GIVEN))
+        on_right_map = min(learned, self.limit)
         if self.is_behind:
             return on_right_map * _BEHIND
         return on_right_map * (_DOUBTED if self.doubted else 1.0)
+
+    @property
+    def _learned(self) -> float:
+        log_odds = evidence_weights(self.extractor) @ self.terms
+        return float(1 / (1 + np.exp(-np.clip(log_odds, -50, 50))))
+
+    @property
+    def limit(self) -> float:
+        """Largest confidence that the covariance of the pose allows."""
+        is_vague = self.predicted_error > ADD_FRACTIONS[0]
+        return min(self.determined, _VAGUE if is_vague else 1.0)
 
     @property
     def confidence_in_matches(self) -> float:
@@ -177,10 +189,6 @@ class Evidence:
         )
 
 
-def _probability(terms: Float64[np.ndarray, " terms"]) -> float:
-    return float(1 / (1 + np.exp(-np.clip(EVIDENCE_WEIGHTS @ terms, -50, 50))))
-
-
 class Verifier:
     """Collects the evidence for poses in one map."""
 
@@ -193,6 +201,7 @@ class Verifier:
             distinct: Which points of the map look like no other, by `distinct_points`.
             sizes: How large its points appear.
         """
+        self._extractor = map.info.extractor
         self._points3D_in_world = map.points3D_in_world
         self._box = map.box
         self._strategy = strategy
@@ -237,6 +246,7 @@ class Verifier:
             doubted=self._doubted(pose),
             determined=self._determined(pose, predicted_error),
             calibrated=calibrated,
+            extractor=self._extractor,
         )
 
     def determined(self, evidence: Evidence, pose: PoseEstimate) -> Evidence:
