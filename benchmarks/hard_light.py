@@ -14,6 +14,7 @@ import argparse
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -29,7 +30,7 @@ from slimsfm.arrays import Image, Points3D
 from slimsfm.cli.output import quiet
 from slimsfm.datasets.base import LoadOptions, map_object
 from slimsfm.datasets.synthetic import Synthetic
-from slimsfm.evaluation.results import Outcomes, PosedQuery, evaluate, join_outcomes, prepare_queries
+from slimsfm.evaluation.results import Outcomes, PosedQuery, evaluate, prepare_queries
 from slimsfm.mapping import Map, read_map, write_map
 from slimsfm.mapping.build import BuildOptions
 from slimsfm.progress import shown
@@ -41,10 +42,10 @@ from slimsfm.weights import Runtime, use_runtime
 
 SEED, WIDTH, HEIGHT = 0, 640, 480
 GAMMA, READ_NOISE = 2.2, 2.0  # read noise in electrons
-SLATS, PENUMBRA_PX = 0.035, 1.0  # period of the slats in meters
+SLATS, PENUMBRA_PX = 0.02, 1.0  # period of the slats in meters
 OFF_SURFACE = 5e-4  # meters from a surface to the start of its ray to the lamp
 STRATEGIES = {"full": "progressive", "default": "direct"}
-BACKDROP = (52.0, 60.0, 74.0)
+BACKDROP, DARK, BRIGHT = (52.0, 60.0, 74.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 Radiance = Float64[np.ndarray, "height width 3"]
 Shade = Float64[np.ndarray, "height width"]
@@ -81,13 +82,13 @@ CONDITIONS = {
         towards=(-0.8, 0.6, 0.5),
         lamp=(1.0, 0.5, 0.15),
         ambient=(0.03, 0.04, 0.08),
-        electrons=60.0,
+        electrons=25.0,
         brightness=0.15,
     ),
-    "over": Condition(electrons=48000.0, brightness=6.0),
-    "under": Condition(electrons=100.0, brightness=1 / 80),
-    "blur": Condition(blur_px=21),
-    "noise": Condition(electrons=12.0),
+    "over": Condition(electrons=160000.0, brightness=20.0),
+    "under": Condition(electrons=30.0, brightness=1 / 270),
+    "blur": Condition(blur_px=13),
+    "noise": Condition(electrons=5.0),
 }
 """The conditions by name."""
 
@@ -106,8 +107,8 @@ def main() -> None:
     contact_sheet(queries.values(), arguments.output / "contact.jpg")
     lines = [HEAD]
     print(HEAD)
-    for method in arguments.methods:
-        for line in rows(method, queries, arguments.output):
+    for name, method in product(queries, arguments.methods):
+        for line in rows(name, method, queries[name], arguments.output):
             lines.append(line)
             print(line, flush=True)
     (arguments.output / "table.md").write_text("\n".join(lines) + "\n")
@@ -145,7 +146,7 @@ class Studio:
         meshes = surrounded(np.random.default_rng(take.seed), textured_object(name, SEED))
         self._white = [white(mesh) for mesh in meshes]
         self._take = take
-        self._colors = Scene(meshes, Light(lamp=(0, 0, 0), ambient=(1, 1, 1), backdrop=BACKDROP))
+        self._colors = Scene(meshes, Light(lamp=DARK, ambient=BRIGHT, backdrop=BACKDROP))
         self._lit: dict[Rgb, Scene] = {}
 
     def radiance(self, condition: Condition, frame: int) -> Radiance:
@@ -153,7 +154,7 @@ class Studio:
         camera, pose = self._take.camera, self._take.cam_from_object[frame]
         towards = condition.towards
         if towards not in self._lit:
-            light = Light(towards=towards, lamp=(1, 1, 1), ambient=(0, 0, 0), backdrop=(0, 0, 0))
+            light = Light(towards=towards, lamp=BRIGHT, ambient=DARK, backdrop=DARK)
             self._lit[towards] = Scene(self._white, light)
         albedo = (render(self._colors, camera, pose) / 255.0) ** GAMMA
         cosine = render(self._lit[towards], camera, pose)[..., 0] / 255.0
@@ -183,7 +184,7 @@ def white(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The same surface, white."""
     made = mesh.copy()
     paper = SimpleMaterial(image=PilImage.new("RGB", (2, 2), "white"))
-    made.visual = TextureVisuals(uv=mesh.visual.uv, material=paper)
+    made.visual = TextureVisuals(uv=np.full((len(mesh.vertices), 2), 0.5), material=paper)
     return made
 
 
@@ -228,43 +229,35 @@ def contact_sheet(queries: Iterable[Queries], path: Path) -> None:
     """One picture per object and condition, at a third of its size."""
     rows = []
     for of_object in queries:
-        pictures = [PilImage.open(chosen[len(chosen) // 4].path) for chosen in of_object.values()]
+        pictures = [PilImage.open(chosen[3 * len(chosen) // 8].path) for chosen in of_object.values()]
         rows.append(np.hstack([np.asarray(one.reduce(3)) for one in pictures]))
     PilImage.fromarray(np.vstack(rows)).save(path, quality=80)
 
 
 HEAD = (
-    "| method | map | condition | within 0.1 d | within 0.02 d | median error | wrong "
-    "| extract | match + pose |\n|---|---|---|---:|---:|---:|---:|---:|---:|"
+    "| object | method | map | condition | within 0.1 d | within 0.02 d | median error | wrong "
+    "| extract | match + pose |\n|---|---|---|---|---:|---:|---:|---:|---:|---:|"
 )
 
 
-def rows(method: str, queries: dict[str, Queries], output: Path) -> Iterator[str]:
-    """Rows of the table of one method: over the queries of all objects, per map and condition."""
-    outcomes: dict[tuple[str, str], list[Outcomes]] = {}
-    for name, of_object in queries.items():
-        maps = mapped(name, method, output)
-        for condition, chosen in of_object.items():
-            prepared = prepare_queries(maps["full"], chosen)
-            for kind, strategy in STRATEGIES.items():
-                found = evaluate(maps[kind], prepared, strategy)
-                outcomes.setdefault((kind, condition), []).append(found)
-    for kind in STRATEGIES:
-        for condition in CONDITIONS:
-            yield row(method, kind, condition, join_outcomes(outcomes[kind, condition]))
+def rows(name: str, method: str, queries: Queries, output: Path) -> Iterator[str]:
+    """Rows of the table of one object and method, per map and condition."""
+    maps = mapped(name, method, output)
+    prepared = {condition: prepare_queries(maps["full"], chosen) for condition, chosen in queries.items()}
+    for kind, strategy in STRATEGIES.items():
+        for condition, chosen in prepared.items():
+            found = evaluate(maps[kind], chosen, strategy)
+            yield f"| {name} | {method} | {kind} | {condition} | {measures(found)} |"
 
 
-def row(method: str, kind: str, condition: str, found: Outcomes) -> str:
-    """One row. Wrong are poses that are given with an error above 0.1 d."""
+def measures(found: Outcomes) -> str:
+    """The values of a row. Wrong are poses that are given with an error above 0.1 d."""
     wrong = np.isfinite(found.error) & (found.error >= 0.1)
     shares = [f"{100 * np.mean(one):.0f} %" for one in (found.error < 0.1, found.error < 0.02, wrong)]
     median = np.median(found.error)
     error = f"{median:.4f} d" if np.isfinite(median) else "none"
     extract, *others = np.median(found.seconds * 1000, axis=0)
-    times = f"{extract:.0f} ms | {sum(others):.1f} ms"
-    return (
-        f"| {method} | {kind} | {condition} | {shares[0]} | {shares[1]} | {error} | {shares[2]} | {times} |"
-    )
+    return f"{shares[0]} | {shares[1]} | {error} | {shares[2]} | {extract:.0f} ms | {sum(others):.1f} ms"
 
 
 def mapped(name: str, method: str, output: Path) -> dict[str, Map]:
