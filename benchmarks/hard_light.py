@@ -13,7 +13,7 @@ table.md and contact.jpg there, and prints the table.
 import argparse
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -72,7 +72,11 @@ class Condition:
     blur_px: int = 0
     """Length of the path of an image point while the shutter is open, in pixels."""
 
+    lifted: bool = False
+    """Whether the 8 bits are then stretched, so that 99 % of all values fill the range."""
 
+
+UNDEREXPOSED = Condition(electrons=30.0, brightness=1 / 270)
 CONDITIONS = {
     "day": Condition(),
     "shadows": Condition(
@@ -86,9 +90,10 @@ CONDITIONS = {
         brightness=0.15,
     ),
     "over": Condition(electrons=160000.0, brightness=20.0),
-    "under": Condition(electrons=30.0, brightness=1 / 270),
+    "under": UNDEREXPOSED,
     "blur": Condition(blur_px=13),
     "noise": Condition(electrons=5.0),
+    "lifted": replace(UNDEREXPOSED, lifted=True),
 }
 """The conditions by name."""
 
@@ -212,7 +217,10 @@ def exposed(radiance: Radiance, condition: Condition, rng: np.random.Generator) 
         radiance = np.maximum(blurred, 0)  # large kernels are applied by a DFT, which rounds
     electrons = rng.poisson(condition.electrons * radiance) + rng.normal(0, READ_NOISE, radiance.shape)
     linear = np.clip(electrons / condition.electrons * condition.brightness, 0, 1)
-    return np.rint(255 * linear ** (1 / GAMMA)).astype(np.uint8)
+    image = np.rint(255 * linear ** (1 / GAMMA))
+    if condition.lifted:
+        image = np.clip(np.rint(image * (255 / np.percentile(image, 99))), 0, 255)
+    return image.astype(np.uint8)
 
 
 def streak(length: int, angle: float) -> np.ndarray:

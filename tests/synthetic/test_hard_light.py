@@ -75,6 +75,16 @@ def test_overexposure_clips_and_noise_grows_as_photons_become_few():
     assert few > 10 * many
 
 
+def test_lifting_only_scales_gray_levels():
+    ramp = np.linspace(0, 1, 100)[None, :, None] * gray(1.0)
+    dark, lifted = (exposed(ramp, CONDITIONS[name], np.random.default_rng(2)) for name in ("under", "lifted"))
+    assert dark.max() < 30
+    assert lifted.max() == 255
+    levels = [np.unique(lifted[dark == level]) for level in np.unique(dark)]
+    assert all(len(one) == 1 for one in levels)
+    assert np.all(np.diff(np.concatenate(levels).astype(int)) >= 0)
+
+
 def test_motion_blur_keeps_the_middle():
     for angle in np.linspace(0, np.pi, 7):
         kernel = streak(13, angle)
