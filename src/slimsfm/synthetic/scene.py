@@ -109,9 +109,14 @@ def textured_object(name: str, seed: int) -> trimesh.Trimesh:
 
 def elsewhere(rng: np.random.Generator, mesh: trimesh.Trimesh) -> Scene:
     """An object in evening light on a patterned table, with clutter around it and posts in front of it."""
+    return Scene(surrounded(rng, mesh), EVENING)
+
+
+def surrounded(rng: np.random.Generator, mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """An object, a patterned table below it, posts in front of it and clutter around it."""
     cloth = texture.page(rng, 2000, 2000, cell=150) // 4 + 110
     table = shapes.ground(2.4, cloth, shapes.lowest(mesh))
-    return Scene([mesh, table, *posts(rng, mesh), *things(rng, mesh)], EVENING)
+    return [mesh, table, *posts(rng, mesh), *things(rng, mesh)]
 
 
 def viewing_distance(mesh: trimesh.Trimesh) -> float:
