@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Float64, Int64
 
-from slimsfm.arrays import Descriptors, Ids, Image, Points2D
+from slimsfm.arrays import Descriptors, Ids, Image, Points2D, evenly_spaced
 from slimsfm.features import Features
 from slimsfm.pose import PoseEstimate
 
@@ -89,7 +89,18 @@ class MatchingOptions:
 _SAME_PX = 4.0  # side of a square in which several images' positions of a point count as one
 
 Target = tuple[Float32[np.ndarray, "_ d"], Int64[np.ndarray, " _"]]
-"""Descriptors to match a query with, and for each the row of its point in the map."""
+"""Descriptors to match a query with, and for each the row of its point in the map.
+
+Rows of one point that follow one another are its appearances: the best one counts, and they are no rivals.
+"""
+
+
+def some_points(points: Ids, most: int) -> Ids:
+    """Rows of at most `most` points of a target, evenly spaced, with all appearances of each."""
+    numbers = np.cumsum(np.diff(points, prepend=-1) != 0) - 1
+    count = int(numbers[-1]) + 1 if len(numbers) else 0
+    return np.flatnonzero(np.isin(numbers, evenly_spaced(count, most)))
+
 
 Rounds = Generator[PointMatches, PoseEstimate | None, None]
 """Yields matches, more in each round; receives the pose estimated from the last ones."""
