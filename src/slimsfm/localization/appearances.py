@@ -17,7 +17,7 @@ from slimsfm.mapping.map import Map
 MOST_APPEARANCES = 4
 """Largest number of appearances of a point."""
 
-_NEAR = 0.5  # of the largest angle between matching descriptors: an observation resembles its mean
+_NEAR = 0.6  # of the largest angle between matching descriptors: an observation resembles its mean
 _STRAY = 0.1  # largest share of a point's observations that resemble no mean
 
 
