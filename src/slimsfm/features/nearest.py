@@ -32,7 +32,7 @@ def match_nearest(
     descriptors2: Float32[np.ndarray, "m d"],
     options: NearestOptions = NearestOptions(),
     *,
-    groups: Int64[np.ndarray, " m"] | None = None,
+    firsts: Int64[np.ndarray, " _"] | None = None,
 ) -> Int64[np.ndarray, "k 2"]:
     """Match two sets of descriptors of unit length, as COLMAP does: mutual nearest, ratio test on angles.
 
@@ -43,15 +43,16 @@ def match_nearest(
         descriptors1: The first set.
         descriptors2: The second set.
         options: How descriptors compare.
-        groups: Rows of `descriptors2` with equal values that follow one another describe the same thing. It
-            is matched at most once, by the most similar of them; the ratio test compares it with others.
+        firsts: Where groups of rows of `descriptors2` start, if several rows describe the same thing. It is
+            matched at most once, by the most similar of them, and only other groups are its rivals.
 
     Returns:
         Pairs (row of `descriptors1`, row of `descriptors2`, the first of its group), sorted by the first.
     """
     if len(descriptors1) == 0 or len(descriptors2) == 0:
         return np.zeros((0, 2), np.int64)
-    layers = _layers(np.arange(len(descriptors2)) if groups is None else groups)
+    count = len(descriptors2)
+    layers = _layers(np.arange(count) if firsts is None else firsts, count)
     if len(layers) > 1:
         descriptors2 = descriptors2[np.concatenate(layers)]
     nearest, best, second, best_of_column = _nearest_two(
@@ -65,11 +66,10 @@ def match_nearest(
     return np.stack([rows, layers[0][nearest[rows]]], axis=1)
 
 
-def _layers(groups: Int64[np.ndarray, " m"]) -> list[Int64[np.ndarray, " _"]]:
+def _layers(firsts: Int64[np.ndarray, " groups"], num_rows: int) -> list[Int64[np.ndarray, " _"]]:
     """The first row of each group, the second row of each that has two, and so on; largest groups first."""
-    firsts = np.flatnonzero(np.diff(groups, prepend=groups[0] - 1))
-    counts = np.diff(firsts, append=len(groups))
-    if len(firsts) < len(groups):
+    counts = np.diff(firsts, append=num_rows)
+    if len(firsts) < num_rows:
         order = np.argsort(-counts, kind="stable")
         firsts, counts = firsts[order], counts[order]
     return [firsts[counts > place] + place for place in range(counts.max())]

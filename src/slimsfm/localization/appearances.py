@@ -31,7 +31,7 @@ class Appearances:
     sums: Float32[np.ndarray, "appearances d"]
     """Sum of the unit descriptors of the observations of each appearance."""
 
-    of_observations: dict[str, Ids]
+    of_observations: dict[str, Int64[np.ndarray, " _"]]
     """By name of image, the appearance that each of its observations belongs to."""
 
 

@@ -27,6 +27,7 @@ from slimsfm.localization.strategy import (
     Query,
     Strategy,
     Target,
+    first_rows,
     some_points,
     unite,
 )
@@ -152,7 +153,7 @@ def match_around(
     if not len(query.keypoints) or not inside.any():
         return PointMatches.none()
     descriptors, points, pixels = target[0][inside], target[1][inside], pixels[inside]
-    starts = np.flatnonzero(np.diff(points, prepend=-1))
+    starts = first_rows(points)
     points, counts = points[starts], np.diff(starts, append=len(points))
     count = min(_CANDIDATES, len(query.keypoints))
     nearest = KDTree(query.keypoints).query(pixels[starts], k=count, distance_upper_bound=radius_px)

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Float64, Int64
 
-from slimsfm.arrays import Descriptors, Ids, Image
+from slimsfm.arrays import Descriptors, Image
 from slimsfm.errors import InputError
 from slimsfm.features import (
     Extractor,
@@ -24,7 +24,7 @@ from slimsfm.features import (
     unit_rows,
 )
 from slimsfm.geometry import Box, project
-from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target
+from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target, first_rows
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 
@@ -161,7 +161,7 @@ def match_target(
     A point is matched by its best appearance, and competes with other points only.
     """
     target_descriptors, points = target
-    pairs = match_nearest(descriptors, target_descriptors, options, groups=points)
+    pairs = match_nearest(descriptors, target_descriptors, options, firsts=first_rows(points))
     return PointMatches(keypoints=pairs[:, 0], points=points[pairs[:, 1]], references=references)
 
 
@@ -169,13 +169,13 @@ class BestCosines(NamedTuple):
     """How similar descriptors are to points, each by its best appearance."""
 
     cosines: Float32[np.ndarray, "n points"]
-    firsts: Ids
+    firsts: Int64[np.ndarray, " points"]
     """The first row of each point in the target."""
 
 
 def best_cosines(descriptors: Descriptors, target: Target) -> BestCosines:
     """Compare descriptors with the points of a target that has at least one."""
-    firsts = np.flatnonzero(np.diff(target[1], prepend=-1))
+    firsts = first_rows(target[1])
     if len(firsts) == len(target[1]):
         return BestCosines(descriptors @ target[0].T, firsts)
     return BestCosines(np.maximum.reduceat(target[0] @ descriptors.T, firsts, axis=0).T, firsts)

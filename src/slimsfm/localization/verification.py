@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from slimsfm.arrays import Ids, Mask, Points2D
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
@@ -318,7 +318,9 @@ def _count(keypoints: Ids) -> int:
     return len(np.unique(keypoints))
 
 
-def _found_there_alone(query: Query, places: Points2D, target: Target, alike: float) -> Mask:
+def _found_there_alone(
+    query: Query, places: Points2D, target: Target, alike: float
+) -> Bool[np.ndarray, " points"]:
     """Which points have a similar keypoint near their place, and no equally similar one far from it."""
     keypoints = query.keypoints[:_STRONGEST]
     cosines, firsts = best_cosines(query.descriptors[:_STRONGEST], target)
