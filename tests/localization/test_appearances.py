@@ -144,7 +144,7 @@ def test_appearances_of_one_point_are_no_rivals():
     """Two nearly equal appearances fail the ratio test as two points, and pass it as one."""
     descriptors = np.eye(4, dtype=np.float32)[[0, 0, 1]]
     descriptors[1, 2] = 0.05
-    query = unit_rows(descriptors[:1] + np.float32([0, 0, 0.02, 0]))
+    query = unit_rows(descriptors[:1] + np.float32([0, 0, 0.024, 0]))
     target = unit_rows(descriptors)
     metric = NearestOptions()
     assert not len(match_target(query, (target, np.array([3, 4, 5])), metric))
