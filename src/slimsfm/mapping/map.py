@@ -46,16 +46,16 @@ class PointDescriptors:
     """One appearance of a point each, of unit length."""
 
     directions: Float32[np.ndarray, "n 3"] | None = None
-    """Viewing direction of each descriptor's point: the mean of the unit vectors towards its cameras, which is short
-    if these differ much. None in older maps."""
+    """Viewing direction of each descriptor's point: the mean of the unit vectors towards its cameras, which is
+    short if these differ much. None in older maps."""
 
     distinct: Mask | None = None
     """Whether a descriptor's point looks unlike all other points of the full map; points with look-alikes are
     weak evidence for a pose. None in older maps."""
 
     sizes: Float32[np.ndarray, " n"] | None = None
-    """Size of the pattern of each descriptor's point, in map units: scale in pixels times depth over focal length.
-    None in older maps, and if the extractor estimates no scales."""
+    """Size of the pattern of each point, in map units: scale in pixels times depth over focal length. None in
+    older maps, and if the extractor estimates no scales."""
 
     def of(self, points: Ids) -> "PointDescriptors":
         """All descriptors of some points."""
