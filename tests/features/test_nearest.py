@@ -82,3 +82,44 @@ def test_the_arguments_are_left_alone():
 def test_bad_options_are_named(values):
     with pytest.raises(ValueError, match=next(iter(values))):
         NearestOptions(**values)
+
+
+def by_definition_of_groups(a, b, groups, options):
+    """Each group stands for its most similar row; then mutual nearest, ratio and distance, one by one."""
+    angles = np.arccos(np.clip(a @ b.T, -1, 1))
+    of_groups = np.stack([angles[:, groups == one].min(axis=1) for one in np.unique(groups)], axis=1)
+    pairs = []
+    for i, row in enumerate(of_groups):
+        order = np.argsort(row)
+        second = row[order[1]] if len(order) > 1 else np.pi
+        limit = min(options.max_ratio * second, options.max_distance)
+        if of_groups[:, order[0]].argmin() == i and row[order[0]] <= limit:
+            pairs.append((i, int(np.flatnonzero(groups == np.unique(groups)[order[0]])[0])))
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(1, 12),
+    m=st.integers(1, 20),
+    ratio=st.floats(0.1, 1),
+    distance=st.floats(0.05, 2),
+)
+def test_groups_match_by_their_most_similar_row_and_rival_other_groups_only(seed, n, m, ratio, distance):
+    rng = np.random.default_rng(seed)
+    a, b = random_units(rng, n, 3), random_units(rng, m, 3)
+    groups = np.sort(rng.integers(0, 8, m))
+    options = NearestOptions(max_ratio=ratio, max_distance=distance)
+    found = match_nearest(a, b, options, firsts=np.unique(groups, return_index=True)[1])
+    assert np.array_equal(found, by_definition_of_groups(a, b, groups, options))
+
+
+def test_groups_of_one_row_match_as_rows_do_and_repeated_rows_change_nothing():
+    rng = np.random.default_rng(0)
+    b = random_units(rng, 700, 8)
+    a = unit_rows(b[rng.permutation(700)[:600]] + 0.1 * rng.normal(size=(600, 8)).astype(np.float32))
+    plain = match_nearest(a, b)
+    assert np.array_equal(match_nearest(a, b, firsts=np.arange(700)), plain)
+    rows = np.repeat(np.arange(700), rng.integers(1, 4, 700))
+    repeated = match_nearest(a, b[rows], firsts=np.unique(rows, return_index=True)[1])
+    assert np.array_equal(np.column_stack([repeated[:, 0], rows[repeated[:, 1]]]), plain)

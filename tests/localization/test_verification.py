@@ -10,7 +10,7 @@ from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.calibration import CALIBRATED, EVIDENCE_WEIGHTS, evidence_weights
 from slimsfm.localization.cameras import QueryCamera
-from slimsfm.localization.point_descriptors import describe_points, mean_descriptors, viewing_directions
+from slimsfm.localization.point_descriptors import describe_appearances, describe_points, viewing_directions
 from slimsfm.localization.round_result import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.strategy import PointMatches, Query
@@ -107,7 +107,7 @@ def test_a_pose_that_sees_the_surface_from_behind_is_not_believed():
     points, pose = one_sided.points3D_in_world, poses(30)[3]
     towards = pose.inverse().translation - points
     behind = np.einsum("nd,nd->n", viewing_directions(one_sided), towards) < 0
-    descriptors = mean_descriptors(one_sided).descriptors
+    descriptors = describe_appearances(one_sided).descriptors
     for rows, is_behind in ((np.flatnonzero(behind), True), (np.flatnonzero(~behind), False)):
         query = Features(
             keypoints=project(points[rows], pose, camera()).astype(np.float32),

@@ -1,5 +1,6 @@
 """Descriptors of points on disk."""
 
+import lzma
 from contextlib import suppress
 
 import numpy as np
@@ -74,6 +75,32 @@ def test_points_are_read_as_they_were_written(tmp_path_factory, chosen, count, d
     assert np.array_equal(read.descriptors, quantize(descriptors).restore())
 
 
+@settings(max_examples=25, deadline=None)
+@given(counts=st.lists(st.integers(1, 4), min_size=1, max_size=12), seed=st.integers(0, 10**6))
+def test_points_are_read_with_all_of_their_appearances(tmp_path_factory, counts, seed):
+    rng = np.random.default_rng(seed)
+    points = np.repeat(3 * np.arange(len(counts)) + 1, counts)
+    count, each = len(points), (points - 1) // 3
+    before = PointDescriptors(
+        points=points,
+        descriptors=random_descriptors(count, 8, seed),
+        directions=rng.uniform(-1, 1, (len(counts), 3)).astype(np.float32)[each],
+        distinct=(rng.random(len(counts)) < 0.5)[each],
+        sizes=np.exp2(rng.integers(-9, 9, len(counts)).astype(np.float32))[each],
+    )
+    path = tmp_path_factory.mktemp("points") / "points.npz"
+    write_point_descriptors(path, before)
+    read = read_point_descriptors(path, 40)
+    assert np.array_equal(read.points, points)
+    assert np.array_equal(read.descriptors, quantize(before.descriptors).restore())
+    assert read.directions == pytest.approx(before.directions, abs=0.5 / 127 + 1e-6)
+    assert np.array_equal(read.distinct, before.distinct)
+    assert np.array_equal(read.sizes, before.sizes)
+    with np.load(path) as file:
+        assert len(file["directions"]) == len(counts)
+        assert ("appearances" in file) == (max(counts) > 1)
+
+
 @pytest.fixture
 def written(tmp_path):
     points = np.arange(0, 80, 2)
@@ -135,6 +162,10 @@ def _with(part, value):
         _with("range", np.zeros(3)),
         _with("range", np.array(["a", "b"])),
         _with("codes", np.zeros(9, np.uint8)),
+        _with("appearances", np.frombuffer(lzma.compress(bytes([1] * 39)), np.uint8)),
+        _with("appearances", np.frombuffer(lzma.compress(bytes([1] * 39 + [0])), np.uint8)),
+        _with("appearances", np.frombuffer(lzma.compress(bytes([1] * 39 + [2])), np.uint8)),
+        _with("appearances", np.zeros(9, np.uint8)),
     ],
 )
 def test_inconsistent_parts_are_refused(written, harm):

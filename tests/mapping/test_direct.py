@@ -1,5 +1,6 @@
 """Maps for direct matching."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +63,36 @@ def test_images_keep_their_poses_but_not_their_features(exact, direct):
     assert all(point.track.length() == 0 for point in direct.model.points3D.values())
     assert (len(direct.features), len(direct.matches)) == (0, 0)
     assert direct.info is exact.info
+
+
+def repeated(map_, rows, counts):
+    """Some points with several descriptors each."""
+    one = described(map_, rows)
+    return one[np.repeat(np.arange(len(one.points)), counts)]
+
+
+def test_a_kept_point_keeps_all_of_its_appearances(exact, tmp_path):
+    rows = np.arange(0, len(exact.point3D_ids), 3)
+    counts = np.arange(len(rows)) % 3 + 1
+    whole = repeated(exact, rows, counts)
+    some = whole.of(rows[1::2])
+    assert np.array_equal(some.points, np.repeat(rows[1::2], counts[1::2]))
+    for made in (direct_map(exact, some), with_points(keep_images(exact, ["001.png"]), exact, some)):
+        kept = made.point3D_ids[made.point_descriptors.points]
+        assert np.array_equal(kept, exact.point3D_ids[some.points])
+        assert np.array_equal(made.point_descriptors.descriptors, some.descriptors)
+        write_map(made, tmp_path / made.kind)
+        again = read_map(tmp_path / made.kind)
+        assert np.array_equal(again.point_descriptors.points, made.point_descriptors.points)
+        assert f"{len(rows[1::2])} " in again.describe()
+
+
+def test_only_maps_with_several_descriptors_per_point_have_the_later_format(exact, chosen, tmp_path):
+    several = repeated(exact, chosen.points, 2)
+    for name, points, version in (("one", chosen, 1), ("several", several, 2)):
+        write_map(direct_map(exact, points), tmp_path / name)
+        assert json.loads((tmp_path / name / "map.json").read_text())["format_version"] == version
+        assert read_map(tmp_path / name).point_descriptors is not None
 
 
 def test_the_full_map_does_not_change(exact, chosen):

@@ -31,35 +31,62 @@ def match_nearest(
     descriptors1: Float32[np.ndarray, "n d"],
     descriptors2: Float32[np.ndarray, "m d"],
     options: NearestOptions = NearestOptions(),
+    *,
+    firsts: Int64[np.ndarray, " _"] | None = None,
 ) -> Int64[np.ndarray, "k 2"]:
     """Match two sets of descriptors of unit length, as COLMAP does: mutual nearest, ratio test on angles.
 
     Each row of either set is matched at most once. The ratio test applies to the rows of `descriptors1`.
     Complexity: O(n m d), one matrix product, computed in blocks of rows that stay in the processor's cache.
 
+    Args:
+        descriptors1: The first set.
+        descriptors2: The second set.
+        options: How descriptors compare.
+        firsts: Where groups of rows of `descriptors2` start, if several rows describe the same thing. It is
+            matched at most once, by the most similar of them, and only other groups are its rivals.
+
     Returns:
-        Pairs (row of `descriptors1`, row of `descriptors2`), sorted by the first.
+        Pairs (row of `descriptors1`, row of `descriptors2`, the first of its group), sorted by the first.
     """
     if len(descriptors1) == 0 or len(descriptors2) == 0:
         return np.zeros((0, 2), np.int64)
-    nearest, best, second, best_of_column = _nearest_two(descriptors1, descriptors2)
+    count = len(descriptors2)
+    layers = _layers(np.arange(count) if firsts is None else firsts, count)
+    if len(layers) > 1:
+        descriptors2 = descriptors2[np.concatenate(layers)]
+    nearest, best, second, best_of_column = _nearest_two(
+        descriptors1, descriptors2, [len(one) for one in layers]
+    )
     angles = _angles(best)
     good = (angles <= options.max_ratio * _angles(second)) & (angles <= options.max_distance)
     rows = np.flatnonzero(good & (best >= best_of_column[nearest]))
     _, first = np.unique(nearest[rows], return_index=True)  # of equal descriptors the first is matched
     rows = rows[np.sort(first)]
-    return np.stack([rows, nearest[rows]], axis=1)
+    return np.stack([rows, layers[0][nearest[rows]]], axis=1)
+
+
+def _layers(firsts: Int64[np.ndarray, " groups"], num_rows: int) -> list[Int64[np.ndarray, " _"]]:
+    """The first row of each group, the second row of each that has two, and so on; largest groups first."""
+    counts = np.diff(firsts, append=num_rows)
+    if len(firsts) < num_rows:
+        order = np.argsort(-counts, kind="stable")
+        firsts, counts = firsts[order], counts[order]
+    return [firsts[counts > place] + place for place in range(counts.max())]
 
 
 def _nearest_two(
-    descriptors1: Float32[np.ndarray, "n d"], descriptors2: Float32[np.ndarray, "m d"]
+    descriptors1: Float32[np.ndarray, "n d"], descriptors2: Float32[np.ndarray, "m d"], sizes: list[int]
 ) -> tuple[
-    Int64[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " m"]
+    Int64[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float32[np.ndarray, " _"]
 ]:
-    """Nearest neighbor of each row, its cosine, the second best cosine, and the best of each column."""
+    """Nearest neighbor of each row, its cosine, the second best cosine, and the best of each column.
+
+    Row i of each of the layers of `descriptors2`, whose sizes are given, belongs to the same column.
+    """
     nearest = np.empty(len(descriptors1), np.int64)
     best, second = np.empty((2, len(descriptors1)), np.float32)
-    best_of_column = np.full(len(descriptors2), -np.inf, np.float32)
+    best_of_column = np.full(sizes[0], -np.inf, np.float32)
     transposed = descriptors2.T
     if len(descriptors1) > _BLOCK:  # for one block the copy takes longer than the product
         transposed = np.ascontiguousarray(transposed)
@@ -68,12 +95,23 @@ def _nearest_two(
         block = slice(start, start + _BLOCK)
         rows = np.arange(len(descriptors1[block]))
         cosines = np.matmul(descriptors1[block], transposed, out=memory[: len(rows)])
+        cosines = _best_of_layers(cosines, sizes)
         nearest[block] = cosines.argmax(axis=1)
         best[block] = cosines[rows, nearest[block]]
         np.maximum(best_of_column, cosines.max(axis=0), out=best_of_column)
         cosines[rows, nearest[block]] = -1
         second[block] = cosines.max(axis=1)
     return nearest, best, second, best_of_column
+
+
+def _best_of_layers(cosines: Float32[np.ndarray, "n m"], sizes: list[int]) -> Float32[np.ndarray, "n _"]:
+    """The best cosine of each column over its layers, in the memory of the first."""
+    start = sizes[0]
+    for size in sizes[1:]:
+        best = cosines[:, :size]
+        np.maximum(best, cosines[:, start : start + size], out=best)
+        start += size
+    return cosines[:, : sizes[0]]
 
 
 _REUSED = local()

@@ -16,12 +16,21 @@ import pycolmap
 from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import KDTree
 
-from slimsfm.arrays import Ids, Points2D, evenly_spaced
+from slimsfm.arrays import Ids, Points2D
 from slimsfm.features import NearestOptions
 from slimsfm.geometry import project
 from slimsfm.localization.point_descriptors import PointSizes
 from slimsfm.localization.strategies import ThroughReferences
-from slimsfm.localization.strategy import PointMatches, PoseGuided, Query, Strategy, Target, unite
+from slimsfm.localization.strategy import (
+    PointMatches,
+    PoseGuided,
+    Query,
+    Strategy,
+    Target,
+    first_rows,
+    some_points,
+    unite,
+)
 from slimsfm.localization.verification import inflation
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate
@@ -107,7 +116,7 @@ class ExactPass:
         else:
             descriptors, points = self._strategy.visible_points(cam_from_world, agreeing)
         shown = np.flatnonzero(self._sizes.show(points, cam_from_world, camera))
-        shown = shown[evenly_spaced(len(shown), _MOST_POINTS)]
+        shown = shown[some_points(points[shown], _MOST_POINTS)]
         return descriptors[shown], points[shown]
 
 
@@ -143,16 +152,20 @@ def match_around(
     inside = np.isfinite(pixels).all(axis=1)
     if not len(query.keypoints) or not inside.any():
         return PointMatches.none()
-    descriptors, points = target[0][inside], target[1][inside]
+    descriptors, points, pixels = target[0][inside], target[1][inside], pixels[inside]
+    starts = first_rows(points)
+    points, counts = points[starts], np.diff(starts, append=len(points))
     count = min(_CANDIDATES, len(query.keypoints))
-    nearest = KDTree(query.keypoints).query(pixels[inside], k=count, distance_upper_bound=radius_px)
+    nearest = KDTree(query.keypoints).query(pixels[starts], k=count, distance_upper_bound=radius_px)
     distances, candidates = (np.reshape(one, (-1, count)) for one in nearest)
     some = np.isfinite(distances[:, 0])
     if not some.any():
         return PointMatches.none()
     candidates, missing = candidates[some], np.isinf(distances[some])
     candidates[missing] = 0
-    cosines = np.einsum("pkd,pd->pk", query.descriptors[candidates], descriptors[some])
+    rows, owners = np.repeat(some, counts), np.repeat(np.arange(some.sum()), counts[some])
+    cosines = np.einsum("pkd,pd->pk", query.descriptors[candidates[owners]], descriptors[rows])
+    cosines = np.maximum.reduceat(cosines, np.flatnonzero(np.diff(owners, prepend=-1)), axis=0)
     cosines[missing] = -1
     good = _unambiguous(query.keypoints, candidates, cosines, metric)
     best = cosines[good].argmax(axis=1)

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from slimsfm.arrays import Descriptors, Image
 from slimsfm.errors import InputError
@@ -24,7 +24,7 @@ from slimsfm.features import (
     unit_rows,
 )
 from slimsfm.geometry import Box, project
-from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target
+from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Target, first_rows
 from slimsfm.mapping.extractor import extractor_of
 from slimsfm.mapping.map import Map
 
@@ -156,10 +156,29 @@ def reference_target(map: Map, name: str) -> Target:
 def match_target(
     descriptors: Descriptors, target: Target, options: NearestOptions, references: int = 0
 ) -> PointMatches:
-    """Match descriptors of a query with those of a target by nearest neighbors."""
+    """Match descriptors of a query with those of a target by nearest neighbors.
+
+    A point is matched by its best appearance, and competes with other points only.
+    """
     target_descriptors, points = target
-    pairs = match_nearest(descriptors, target_descriptors, options)
+    pairs = match_nearest(descriptors, target_descriptors, options, firsts=first_rows(points))
     return PointMatches(keypoints=pairs[:, 0], points=points[pairs[:, 1]], references=references)
+
+
+class BestCosines(NamedTuple):
+    """How similar descriptors are to points, each by its best appearance."""
+
+    cosines: Float32[np.ndarray, "n points"]
+    firsts: Int64[np.ndarray, " points"]
+    """The first row of each point in the target."""
+
+
+def best_cosines(descriptors: Descriptors, target: Target) -> BestCosines:
+    """Compare descriptors with the points of a target that has at least one."""
+    firsts = first_rows(target[1])
+    if len(firsts) == len(target[1]):
+        return BestCosines(descriptors @ target[0].T, firsts)
+    return BestCosines(np.maximum.reduceat(target[0] @ descriptors.T, firsts, axis=0).T, firsts)
 
 
 _MARGIN = 0.25  # of the size of the box in the image, added on each side
@@ -220,7 +239,7 @@ def match_near(
     camera: pycolmap.Camera,
     matching: NearestOptions = NearestOptions(),
 ) -> PointMatches:
-    """Match descriptors like `match_nearest`, but only those that are near each other in the image.
+    """Match descriptors like `match_target`, but only those that are near each other in the image.
 
     Args:
         query: The query.
@@ -234,7 +253,8 @@ def match_near(
     descriptors, points, pixels = target[0][inside], target[1][inside], pixels[inside]
     if not len(query.keypoints) or not len(points):
         return PointMatches.none()
-    cosines = query.descriptors @ descriptors.T
+    cosines, firsts = best_cosines(query.descriptors, (descriptors, points))
+    points, pixels = points[firsts], pixels[firsts]
     keypoints, places = query.keypoints.astype(np.float32), pixels.astype(np.float32)
     radius = np.float32(_RADIUS * max(camera.width, camera.height))
     for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""Describe the points of a map: mean descriptor, viewing direction, and whether other points look alike."""
+"""Describe the points of a map: appearances, viewing direction, and whether other points look alike."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from jaxtyping import Float32
 from slimsfm.arrays import Descriptors, Ids, Mask
 from slimsfm.features import unit_rows
 from slimsfm.features.nearest import learn_words, nearest_word
+from slimsfm.localization.appearances import descriptor_sums, find_appearances
 from slimsfm.mapping.map import Map, PointDescriptors
 
 _ALIKE = 0.5  # of the largest angle between matching descriptors: points look alike
@@ -18,17 +19,22 @@ _FAR = 0.1  # of the diagonal: confusing a point with a nearer one hardly harms 
 
 def describe_points(map: Map) -> PointDescriptors:
     """Describe all points, including which of them look like no other point of the map."""
-    described = mean_descriptors(map)
-    return replace(described, distinct=_distinct(map, described.descriptors))
+    described = describe_appearances(map)
+    return replace(described, distinct=_distinct(map, unit_rows(descriptor_sums(map)))[described.points])
 
 
-def mean_descriptors(map: Map) -> PointDescriptors:
-    """Describe all points by the mean of their observations' descriptors, normalized, and by directions."""
+def describe_appearances(map: Map) -> PointDescriptors:
+    """Describe all points by their appearances and by directions.
+
+    An appearance is the normalized mean of the descriptors of observations that look alike, see
+    `find_appearances`.
+    """
+    found, sizes = find_appearances(map), _sizes(map)
     return PointDescriptors(
-        points=np.arange(len(map.point3D_ids), dtype=np.int64),
-        descriptors=unit_rows(descriptor_sums(map)),
-        directions=_directions(map),
-        sizes=_sizes(map),
+        points=found.points,
+        descriptors=unit_rows(found.sums),
+        directions=_directions(map)[found.points],
+        sizes=None if sizes is None else sizes[found.points],
     )
 
 
@@ -41,17 +47,6 @@ def distinct_points(map: Map) -> Mask:
     if stored.distinct is not None:
         distinct[stored.points] = stored.distinct
     return distinct
-
-
-def descriptor_sums(map: Map) -> Float32[np.ndarray, "points d"]:
-    """The sum of the unit descriptors of each point's observations."""
-    sums: np.ndarray | None = None
-    for name, seen in map.observations.items():
-        descriptors = unit_rows(map.features[name].descriptors[seen.rows])
-        if sums is None:
-            sums = np.zeros((len(map.point3D_ids), descriptors.shape[1]), np.float32)
-        np.add.at(sums, seen.points, descriptors)  # an image may see a point twice
-    return np.zeros((0, 0), np.float32) if sums is None else sums
 
 
 def viewing_directions(map: Map) -> Float32[np.ndarray, "points 3"]:

@@ -16,8 +16,9 @@ from scipy.sparse import csr_array
 from slimsfm.arrays import Descriptors, Ids
 from slimsfm.features import unit_rows
 from slimsfm.features.nearest import vlad
+from slimsfm.localization.appearances import descriptor_sums
 from slimsfm.localization.matching import ReferenceMatching, match_target, matching_with
-from slimsfm.localization.point_descriptors import descriptor_sums, mean_descriptors
+from slimsfm.localization.point_descriptors import describe_appearances
 from slimsfm.localization.strategy import MatchingOptions, PointMatches, Query, Rounds, Target, unite
 from slimsfm.mapping.descriptors import describe_images
 from slimsfm.mapping.map import Map, check_has_features, observed
@@ -187,12 +188,12 @@ class Direct:
 
     def __init__(self, map: Map, options: MatchingOptions = MatchingOptions()) -> None:  # noqa: ARG002
         self._nearest = map.descriptor_metric
-        self._described = map.point_descriptors or mean_descriptors(map)
+        self._described = map.point_descriptors or describe_appearances(map)
         self._positions = map.points3D_in_world[self._described.points].astype(np.float32)
         self._target = self._described.descriptors, self._described.points
 
     def rounds(self, query: Query) -> Rounds:
-        """Match the strongest keypoints with the points' mean descriptors, then all keypoints."""
+        """Match the strongest keypoints with the points' appearances, then all keypoints."""
         counts = [count for count in _EARLY_ROUNDS if count < len(query.descriptors)]
         for count in (*counts, len(query.descriptors)):
             yield unite([match_target(query.descriptors[:count], self._target, self._nearest)])

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Float64, Int64
 
-from slimsfm.arrays import Descriptors, Ids, Image, Points2D
+from slimsfm.arrays import Descriptors, Ids, Image, Points2D, evenly_spaced
 from slimsfm.features import Features
 from slimsfm.pose import PoseEstimate
 
@@ -89,7 +89,27 @@ class MatchingOptions:
 _SAME_PX = 4.0  # side of a square in which several images' positions of a point count as one
 
 Target = tuple[Float32[np.ndarray, "_ d"], Int64[np.ndarray, " _"]]
-"""Descriptors to match a query with, and for each the row of its point in the map."""
+"""Descriptors to match a query with, and for each the row of its point in the map.
+
+If the points are in ascending order, rows of one point are its appearances: the best one counts, and they are
+no rivals. Otherwise they are keypoints of an image that sees the point twice, and each is matched by itself.
+"""
+
+
+def first_rows(points: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " _"]:
+    """The first of each point's appearances in a target; all rows, if these are keypoints of an image."""
+    steps = np.diff(points, prepend=-1)
+    return np.flatnonzero(steps) if np.all(steps >= 0) else np.arange(len(points))
+
+
+def some_points(points: Int64[np.ndarray, " n"], most: int) -> Int64[np.ndarray, " _"]:
+    """Rows of at most `most` points of a target, evenly spaced, with all appearances of each."""
+    firsts = first_rows(points)
+    counts = np.diff(firsts, append=len(points))
+    chosen = np.zeros(len(firsts), bool)
+    chosen[evenly_spaced(len(firsts), most)] = True
+    return np.flatnonzero(np.repeat(chosen, counts))
+
 
 Rounds = Generator[PointMatches, PoseEstimate | None, None]
 """Yields matches, more in each round; receives the pose estimated from the last ones."""

@@ -36,13 +36,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
-from slimsfm.arrays import Descriptors, Ids, Mask, Points2D, evenly_spaced
+from slimsfm.arrays import Ids, Mask, Points2D
 from slimsfm.geometry import ADD_FRACTIONS, corner_error, project
 from slimsfm.localization.calibration import evidence_weights
+from slimsfm.localization.matching import best_cosines
 from slimsfm.localization.point_descriptors import PointSizes, viewing_directions
-from slimsfm.localization.strategy import PointMatches, Query, Strategy
+from slimsfm.localization.strategy import PointMatches, Query, Strategy, Target, some_points
 from slimsfm.mapping.map import Map
 from slimsfm.pose import PoseEstimate, RansacOptions, estimate_pose
 from slimsfm.pose.camera_fit import misfit
@@ -310,8 +311,9 @@ class Verifier:
         visible = np.flatnonzero(inside & self._sizes.show(points, pose.cam_from_world, camera))
         if not len(visible):
             return 0.0
-        visible = visible[evenly_spaced(len(visible), _CHECKED)]
-        return float(_found_there_alone(query, pixels[visible], descriptors[visible], self._alike).mean())
+        visible = visible[some_points(points[visible], _CHECKED)]
+        target = descriptors[visible], points[visible]
+        return float(_found_there_alone(query, pixels[visible], target, self._alike).mean())
 
 
 def _doubtful_images(map: Map) -> Mask:
@@ -330,12 +332,15 @@ def _count(keypoints: Ids) -> int:
     return len(np.unique(keypoints))
 
 
-def _found_there_alone(query: Query, places: Points2D, descriptors: Descriptors, alike: float) -> Mask:
-    """Which places have a similar keypoint near them, and no equally similar one far from them."""
+def _found_there_alone(
+    query: Query, places: Points2D, target: Target, alike: float
+) -> Bool[np.ndarray, " points"]:
+    """Which points have a similar keypoint near their place, and no equally similar one far from it."""
     keypoints = query.keypoints[:_STRONGEST]
+    cosines, firsts = best_cosines(query.descriptors[:_STRONGEST], target)
+    cosines, places = cosines.T, places[firsts]
     if not len(keypoints):
         return np.zeros(len(places), dtype=bool)
-    cosines = descriptors @ query.descriptors[:_STRONGEST].T
     best = cosines.argmax(axis=1)
     angles = np.arccos(np.clip(cosines[np.arange(len(places)), best], -1, 1))
     found = (np.linalg.norm(places - keypoints[best], axis=1) < _NEAR_PX) & (angles <= alike)

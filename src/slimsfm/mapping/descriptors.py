@@ -90,16 +90,20 @@ def unpack(arrays: Mapping[str, np.ndarray], count: int) -> Descriptors:
 
 
 def write_point_descriptors(path: Path, points: PointDescriptors) -> None:
-    """Write descriptors of points, quantized and compressed."""
-    steps = np.diff(points.points, prepend=-1).astype(np.uint32)  # mostly 1, which compresses well
+    """Write descriptors of points, quantized and compressed; what a point has once is written once."""
+    firsts = points.firsts
+    steps = np.diff(points.points[firsts], prepend=-1).astype(np.uint32)  # mostly 1, which compresses well
     arrays: dict[str, Any] = pack(points.descriptors)
     arrays["points"] = np.frombuffer(lzma.compress(steps.tobytes()), np.uint8)
+    if len(firsts) < len(points.points):
+        counts = np.diff(firsts, append=len(points.points)).astype(np.uint8)
+        arrays["appearances"] = np.frombuffer(lzma.compress(counts.tobytes()), np.uint8)
     if points.directions is not None:
-        arrays["directions"] = np.round(_INT8_MAX * points.directions).astype(np.int8)
+        arrays["directions"] = np.round(_INT8_MAX * points.directions[firsts]).astype(np.int8)
     if points.distinct is not None:
-        arrays["distinct"] = np.packbits(points.distinct)
+        arrays["distinct"] = np.packbits(points.distinct[firsts])
     if points.sizes is not None:
-        arrays["log2_sizes"] = np.clip(np.log2(points.sizes), *_LOG2_LIMITS).astype(np.float16)
+        arrays["log2_sizes"] = np.clip(np.log2(points.sizes[firsts]), *_LOG2_LIMITS).astype(np.float16)
     with path.open("wb") as file:
         np.savez(file, **arrays)
 
@@ -117,13 +121,26 @@ def read_point_descriptors(path: Path, num_points: int) -> PointDescriptors:
         points = np.cumsum(steps, dtype=np.int64) - 1
         if not len(points) or points[-1] >= num_points or not steps.all():
             raise ValueError(f"its rows do not belong to {num_points} points")
-        return PointDescriptors(
+        counts, count = _unpack_counts(arrays, len(points)), len(points)
+        each = PointDescriptors(
             points=points,
-            descriptors=unpack(arrays, len(points)),
-            directions=_unpack_directions(arrays, len(points)) if "directions" in arrays else None,
-            distinct=_unpack_bits(arrays["distinct"], len(points)) if "distinct" in arrays else None,
-            sizes=_unpack_sizes(arrays["log2_sizes"], len(points)) if "log2_sizes" in arrays else None,
+            descriptors=np.zeros((count, 0), np.float32),
+            directions=_unpack_directions(arrays, count) if "directions" in arrays else None,
+            distinct=_unpack_bits(arrays["distinct"], count) if "distinct" in arrays else None,
+            sizes=_unpack_sizes(arrays["log2_sizes"], count) if "log2_sizes" in arrays else None,
         )
+        rows = np.repeat(np.arange(count), counts)
+        return replace(each[rows], descriptors=unpack(arrays, len(rows)))
+
+
+def _unpack_counts(arrays: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray, " n"]:
+    """Number of descriptors of each point; one where the file does not say."""
+    if "appearances" not in arrays:
+        return np.ones(count, np.uint8)
+    counts = np.frombuffer(unpacked(arrays["appearances"].tobytes(), count), np.uint8)
+    if len(counts) != count or not counts.all():
+        raise ValueError(f"it does not have descriptors of each of {count} points")
+    return counts
 
 
 def _unpack_directions(arrays: Mapping[str, np.ndarray], count: int) -> Float32[np.ndarray, "n 3"]:

@@ -19,8 +19,10 @@ from slimsfm.mapping.map import Map
 from slimsfm.mapping.quality import quality_from_json
 from slimsfm.photos import Orientation
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Version of the format; maps of later versions are rejected."""
+
+_ONE_DESCRIPTOR = 1  # version of maps whose points have one descriptor each, which older programs read too
 
 _NAME = "map.json"
 
@@ -43,13 +45,19 @@ def write_info(map: Map, folder: Path) -> None:
     (folder / _NAME).write_text(json.dumps(data, indent=2) + "\n")
 
 
+def _format_version(map: Map) -> int:
+    described = map.point_descriptors
+    is_older = described is None or len(described.firsts) == len(described.points)
+    return _ONE_DESCRIPTOR if is_older else FORMAT_VERSION
+
+
 def _info_to_json(map: Map) -> dict:
     info = map.info
     used = {image.camera_id for image in map.images.values()}
     devices = {str(key): asdict(device) for key, device in sorted(info.devices.items()) if key in used}
     tags = {name: info.exif_orientations[name] for name in map.images if name in info.exif_orientations}
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": _format_version(map),
         "extractor": {"name": info.extractor, "options": info.extractor_options},
         "box": {
             "center": info.box.center.tolist(),

@@ -37,28 +37,37 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointDescriptors:
-    """Points of a map for direct matching, with one descriptor per point."""
+    """Points of a map for direct matching, with one or more descriptors per point: its appearances."""
 
     points: Ids
-    """Rows of the points in `Map.points3D_in_world`, ascending."""
+    """Rows of the points in `Map.points3D_in_world`, ascending; repeated for each further descriptor."""
 
     descriptors: Descriptors
-    """Descriptor per point, of unit length."""
+    """One appearance of a point each, of unit length."""
 
     directions: Float32[np.ndarray, "n 3"] | None = None
-    """Viewing direction per point: the mean of the unit vectors towards the cameras that observe it, which is
-    short if these vectors differ much. None in older maps."""
+    """Viewing direction of each descriptor's point: the mean of the unit vectors towards its cameras, which is
+    short if these differ much. None in older maps."""
 
     distinct: Mask | None = None
-    """Whether a point looks unlike all other points of the full map; points with look-alikes are weak
-    evidence for a pose. None in older maps."""
+    """Whether a descriptor's point looks unlike all other points of the full map; points with look-alikes are
+    weak evidence for a pose. None in older maps."""
 
     sizes: Float32[np.ndarray, " n"] | None = None
-    """Size of the pattern that the keypoints of each point describe, in map units: scale in pixels times
-    depth over focal length. None in older maps, and if the extractor estimates no scales."""
+    """Size of the pattern of each point, in map units: scale in pixels times depth over focal length. None in
+    older maps, and if the extractor estimates no scales."""
+
+    def of(self, points: Ids) -> "PointDescriptors":
+        """All descriptors of some points."""
+        return self[np.flatnonzero(np.isin(self.points, points))]
+
+    @cached_property
+    def firsts(self) -> Ids:
+        """The first row of each point."""
+        return np.flatnonzero(np.diff(self.points, prepend=-1))
 
     def __getitem__(self, rows: Ids) -> "PointDescriptors":
-        """Select points by row, in this order."""
+        """Select descriptors by row, in this order."""
         return PointDescriptors(
             points=self.points[rows],
             descriptors=self.descriptors[rows],
@@ -130,7 +139,7 @@ class Map:
         if self.kind == "full":
             return f"{parts} ({self.info.origin})"
         if self.point_descriptors is not None:
-            parts += f", {len(self.point_descriptors.points)} of them for direct matching"
+            parts += f", {len(self.point_descriptors.firsts)} of them for direct matching"
         return f"{parts}, reduced from a larger map ({self.info.origin})"
 
     @property

@@ -66,7 +66,7 @@ def direct_map(map: Map, chosen: PointDescriptors) -> Map:
     """
     model = copy_images(map, list(map.images), keypoints=False)
     copy_points(map, model, {point3D_id: [] for point3D_id in map.point3D_ids[chosen.points].tolist()})
-    points = np.arange(len(chosen.points), dtype=np.int64)
+    _, points = np.unique(chosen.points, return_inverse=True)
     descriptors = replace(chosen, points=points)
     return replace(
         map,

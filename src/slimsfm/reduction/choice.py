@@ -151,7 +151,7 @@ def apply_choice(map: Map, choice: Choice, *, described: PointDescriptors | None
     if choice.use == "images":
         return keep_images(map, choice.images)
     described = describe_points(map) if described is None else described
-    return direct_map(map, described[choice.points])
+    return direct_map(map, described.of(choice.points))
 
 
 def points_seen(map: Map, images: tuple[str, ...]) -> Ids:

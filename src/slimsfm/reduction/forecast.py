@@ -277,9 +277,8 @@ class Trials:
         return corner_error(pose.cam_from_world, self._map.images[name].cam_from_world(), self._map.box)
 
     def _described(self, points: Ids, name: str) -> Target:
-        descriptors = self._left_out.describe(points, name)
-        known = descriptors.any(axis=1)
-        return quantize(descriptors[known]).restore(), points[known]
+        descriptors, known = self._left_out.describe(points, name)
+        return quantize(descriptors).restore(), known
 
     def _nearest(self, name: str) -> list[Target]:
         names = list(self._map.images)

@@ -357,5 +357,5 @@ def _kept(map: Map, forecast: Mapping[str, Candidate]) -> Map:
     if len(forecast) == 1:
         (one,) = forecast.values()
         return apply_choice(map, one.choice)
-    points = describe_points(map)[forecast["direct"].choice.points]
+    points = describe_points(map).of(forecast["direct"].choice.points)
     return with_points(apply_choice(map, forecast["images"].choice), map, points)

@@ -15,10 +15,12 @@ from jaxtyping import Float32, Float64
 from scipy.sparse import csr_array
 
 from slimsfm.arrays import Descriptors, Ids, Points2D
-from slimsfm.features import match_nearest, unit_rows
+from slimsfm.features import unit_rows
 from slimsfm.geometry import motions, reprojection_errors
+from slimsfm.localization.appearances import find_appearances
 from slimsfm.localization.extraction import SMALLEST_SCALE_PX, first_size
-from slimsfm.localization.point_descriptors import descriptor_sums
+from slimsfm.localization.matching import match_target
+from slimsfm.localization.strategy import Target
 from slimsfm.mapping.map import Map, observed
 from slimsfm.pose import projection_jacobian
 from slimsfm.progress import ProgressBar, silent
@@ -47,7 +49,9 @@ class LeftOut:
 
     def __init__(self, map: Map) -> None:
         self._map = map
-        self._sums = descriptor_sums(map)
+        self._found = find_appearances(map)
+        self._firsts = np.flatnonzero(np.diff(self._found.points, prepend=-1))
+        self._counts = np.diff(self._firsts, append=len(self._found.points))
         self.query = lru_cache(maxsize=_CACHED)(self._query)
 
     def _query(self, name: str) -> LeftOutImage:
@@ -58,20 +62,24 @@ class LeftOut:
             scales=None if features.frames is None else features.frames[:, 0].astype(np.float64),
         )
 
-    def describe(self, points: Ids, name: str) -> Float32[np.ndarray, "n d"]:
-        """Mean descriptors of points without the image; zeros, which match nothing, if no other sees them.
+    def describe(self, points: Ids, name: str) -> Target:
+        """The appearances of points without the image's observations; none of points that no other sees.
 
         Args:
             points: Rows of the map's points, ascending.
             name: The image that is left out.
         """
-        sums = self._sums[points]
-        own = self._map.observations[name]
-        place = np.searchsorted(points, own.points).clip(max=len(points) - 1)
-        seen = points[place] == own.points
-        np.subtract.at(sums, place[seen], self.query(name).descriptors[own.rows[seen]])
-        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-        return np.where(lengths > _NOTHING_LEFT, sums / np.maximum(lengths, _NOTHING_LEFT), 0)
+        counts = self._counts[points]
+        ends = np.cumsum(counts)
+        rows = np.repeat(self._firsts[points] - ends + counts, counts) + np.arange(counts.sum())
+        sums, own = self._found.sums[rows], self._found.of_observations[name]
+        place = np.searchsorted(rows, own).clip(max=len(rows) - 1)
+        seen = rows[place] == own
+        seen_rows = self._map.observations[name].rows[seen]
+        np.subtract.at(sums, place[seen], self.query(name).descriptors[seen_rows])
+        lengths = np.linalg.norm(sums, axis=1)
+        left = lengths > _NOTHING_LEFT
+        return sums[left] / lengths[left, None], self._found.points[rows[left]]
 
 
 _MAX_ERROR_PX = 4.0  # of a correct match
@@ -130,17 +138,17 @@ class _Uses(NamedTuple):
 
 def _usable(map: Map, left_out: LeftOut, name: str, points: Ids) -> _Uses:
     query, factor = left_out.query(name), map.shrink_factor(name)
-    pairs = match_nearest(query.descriptors, left_out.describe(points, name), map.descriptor_metric)
-    matched = points[pairs[:, 1]]
+    matches = match_target(query.descriptors, left_out.describe(points, name), map.descriptor_metric)
+    matched = matches.points
     errors = reprojection_errors(
-        query.keypoints[pairs[:, 0]],
+        query.keypoints[matches.keypoints],
         map.points3D_in_world[matched],
         map.images[name].cam_from_world(),
         map.camera(name),
     )
     good = np.flatnonzero(errors <= _MAX_ERROR_PX * factor)
     good = good[np.argsort(matched[good], kind="stable")]
-    scales = None if query.scales is None else query.scales[pairs[good, 0]]
+    scales = None if query.scales is None else query.scales[matches.keypoints[good]]
     return _Uses(matched[good], scales, factor)
 
 
