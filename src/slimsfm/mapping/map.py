@@ -46,8 +46,8 @@ class PointDescriptors:
     """One appearance of a point each, of unit length."""
 
     directions: Float32[np.ndarray, "n 3"] | None = None
-    """Viewing direction of each descriptor's point: the mean of the unit vectors towards its cameras, which is
-    short if these differ much. None in older maps."""
+    """Viewing direction of each descriptor's point: the mean of the unit vectors towards its cameras, short
+    if these differ much. None in older maps."""
 
     distinct: Mask | None = None
     """Whether a descriptor's point looks unlike all other points of the full map; points with look-alikes are
