@@ -46,12 +46,10 @@ class PointDescriptors:
     """One appearance of a point each, of unit length."""
 
     directions: Float32[np.ndarray, "n 3"] | None = None
-    """Viewing direction of each point: the mean of the unit vectors towards the cameras that observe it, which
-    is short if these vectors differ much. None in older maps."""
+    """Mean of the unit vectors towards a point's cameras; short if they differ much. None in older maps."""
 
     distinct: Mask | None = None
-    """Whether a point looks unlike all other points of the full map; points with look-alikes are weak
-    evidence for a pose. None in older maps."""
+    """Whether a point looks unlike all others of the full map, else it is weak evidence. None in older maps."""
 
     sizes: Float32[np.ndarray, " n"] | None = None
     """Size of the pattern of each point, in map units: scale in pixels times depth over focal length. None in
