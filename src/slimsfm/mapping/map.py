@@ -49,7 +49,7 @@ class PointDescriptors:
     """Mean of the unit vectors towards a point's cameras; short if they differ much. None in older maps."""
 
     distinct: Mask | None = None
-    """Whether a point looks unlike all others of the full map, else it is weak evidence. None in older maps."""
+    """Whether a point looks unlike all others of the full map; else it is weak evidence. None in old maps."""
 
     sizes: Float32[np.ndarray, " n"] | None = None
     """Size of the pattern of each point, in map units: scale in pixels times depth over focal length. None in
