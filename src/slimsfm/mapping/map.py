@@ -37,7 +37,7 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointDescriptors:
-    """Points of a map for direct matching, with one or more descriptors per point: its appearances."""
+    """Points of a map for direct matching; a point has a row for each of its appearances."""
 
     points: Ids
     """Rows of the points in `Map.points3D_in_world`, ascending; repeated for each further descriptor."""
@@ -46,12 +46,10 @@ class PointDescriptors:
     """One appearance of a point each, of unit length."""
 
     directions: Float32[np.ndarray, "n 3"] | None = None
-    """Viewing direction of each descriptor's point: the mean of the unit vectors towards its cameras, short
-    if these differ much. None in older maps."""
+    """Mean of the unit vectors towards a point's cameras; short if they differ much. None in older maps."""
 
     distinct: Mask | None = None
-    """Whether a descriptor's point looks unlike all other points of the full map; points with look-alikes are
-    weak evidence for a pose. None in older maps."""
+    """Whether a point looks unlike all others of the full map; else it is weak evidence. None in old maps."""
 
     sizes: Float32[np.ndarray, " n"] | None = None
     """Size of the pattern of each point, in map units: scale in pixels times depth over focal length. None in
