@@ -337,10 +337,10 @@ def _found_there_alone(
 ) -> Bool[np.ndarray, " points"]:
     """Which points have a similar keypoint near their place, and no equally similar one far from it."""
     keypoints = query.keypoints[:_STRONGEST]
+    if not len(keypoints):  # the strategy finds places itself
+        return np.zeros(len(places), dtype=bool)
     cosines, firsts = best_cosines(query.descriptors[:_STRONGEST], target)
     cosines, places = cosines.T, places[firsts]
-    if not len(keypoints):
-        return np.zeros(len(places), dtype=bool)
     best = cosines.argmax(axis=1)
     angles = np.arccos(np.clip(cosines[np.arange(len(places)), best], -1, 1))
     found = (np.linalg.norm(places - keypoints[best], axis=1) < _NEAR_PX) & (angles <= alike)
