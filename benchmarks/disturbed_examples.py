@@ -20,7 +20,7 @@ from disturbances import (
     given_camera,
 )
 from disturbed_scenes import MappedScene
-from slimsfm.arrays import Image
+from slimsfm.arrays import Image, evenly_spaced
 from slimsfm.evaluation.results import PosedQuery
 from slimsfm.features import Features, load_extractor
 from slimsfm.files import replacing
@@ -91,7 +91,7 @@ def examples(
 
 def spread(queries: Sequence[PosedQuery], count: int) -> list[PosedQuery]:
     """This many of the queries, or all, spread evenly."""
-    chosen = np.unique(np.linspace(0, len(queries) - 1, min(count, len(queries))).round().astype(int))
+    chosen = evenly_spaced(len(queries), count)
     return [queries[index] for index in chosen]
 
 

@@ -25,6 +25,7 @@ from jaxtyping import Float64
 from benchmark_scenes import Scene, rendered, scenes
 from deceptive_scenes import deception
 from posed_scenes import posed
+from slimsfm.arrays import evenly_spaced
 from slimsfm.evaluation.results import PosedQuery, outcomes_of
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
 from slimsfm.mapping import Map, read_map, write_map
@@ -101,7 +102,7 @@ def _scenes(folders: list[Path], objects: list[str], output: Path) -> Iterator[S
 def _measured(scene: Scene, ways: list[str], most: int, output: Path) -> list[Row]:
     maps = {"full": scene.references, "slim": _slim(scene, output)}
     localizers = {way: Localizer(maps[WAYS[way][0]], WAYS[way][1]) for way in ways}
-    places = np.linspace(0, len(scene.queries) - 1, min(most, len(scene.queries))).round().astype(int)
+    places = evenly_spaced(len(scene.queries), most)
     queries = [scene.queries[place].query for place in places.tolist()]
     found: dict[str, list[_Timed]] = {way: [] for way in ways}
     for way in shown((*ways, *reversed(ways)), scene.name):

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from benchmark_scenes import Scene, scenes
-from slimsfm.arrays import Image
+from slimsfm.arrays import Image, evenly_spaced
 from slimsfm.evaluation.results import PreparedQuery
 from slimsfm.features import Features, load_extractor, unit_rows
 from slimsfm.geometry import corner_error, reprojection_errors
@@ -112,7 +112,7 @@ def main() -> None:
 def disturb(scene: Scene, other: Scene, name: str, most: int) -> Iterator[Pair]:
     """Disturb queries of a scene; those of another one hide things."""
     extractor = load_extractor(scene.references.info.extractor, scene.references.info.extractor_options)
-    places = np.linspace(0, len(scene.queries) - 1, min(most, len(scene.queries))).round().astype(int)
+    places = evenly_spaced(len(scene.queries), most)
     for number, place in enumerate(places.tolist()):
         query = scene.queries[place]
         image = read_image(query.query.path, query.query.orientation)

@@ -141,7 +141,7 @@ def _from_package(package: Package) -> FoundWeights | None:
     path = Path(str(installed.locate_file(package.file)))
     if not path.is_file():
         return None
-    if _checksum_of(path) != package.sha256:
+    if checksum_of(path) != package.sha256:
         raise InputError(
             f"{path}: not the published weights (the checksum differs); install the package again: "
             f"{package.install} --force-reinstall"
@@ -155,14 +155,19 @@ def check_weights(path: Path, weights: WeightFile) -> None:
     Raises:
         InputError: The checksum differs, or the file cannot be read.
     """
-    if weights.sha256 is not None and _checksum_of(path) != weights.sha256:
+    if weights.sha256 is not None and checksum_of(path) != weights.sha256:
         raise InputError(
             f"{path}: not the published weights (the checksum differs); "
             f"get {weights.file} from {weights.source}"
         )
 
 
-def _checksum_of(path: Path) -> str:
+def checksum_of(path: Path) -> str:
+    """SHA-256 of a file, computed once as long as the file does not change.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
     try:
         stat = path.stat()
         return _sha256(path, stat.st_size, stat.st_mtime_ns)

@@ -113,7 +113,7 @@ class OnDevice(Generic[Key]):
     """Keeps tensors on a GPU as long as the object lives that they were made from, up to a limit of memory.
 
     Reference images, which are matched with every query, are sent there once. What exceeds the limit is made
-    anew each time, as is everything on a CPU, where this costs less than the memory.
+    again each time, as is everything on a CPU, where this costs less than the memory.
     """
 
     def __init__(

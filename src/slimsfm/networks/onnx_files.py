@@ -4,7 +4,6 @@ If the weights folder holds METHOD.onnx, the method runs it on the CPU. The file
 checksum of its weights, and is refused if they do not match.
 """
 
-import hashlib
 import os
 import sys
 from collections.abc import Callable
@@ -18,7 +17,7 @@ import numpy as np
 
 from slimsfm.errors import InputError
 from slimsfm.weight_files import WEIGHTS
-from slimsfm.weights import current_runtime, find_weights, remind_of_license
+from slimsfm.weights import checksum_of, current_runtime, find_weights, remind_of_license
 
 ArrayRun = Callable[..., tuple[np.ndarray, ...]]
 """Takes the inputs of a network in order, and returns its outputs in order."""
@@ -103,7 +102,7 @@ def _remedy(method: str) -> str:
 def weights_checksum(method: str) -> str:
     """Checksum of the weights in the weights folder or in a package; empty if they are in neither."""
     found = find_weights(method)
-    return hashlib.sha256(found.path.read_bytes()).hexdigest() if found else ""
+    return checksum_of(found.path) if found else ""
 
 
 def import_for_onnx(package: str) -> Any:
