@@ -11,7 +11,7 @@ from slimsfm.domination import exact, random_greedy
 from slimsfm.evaluation import scores
 from slimsfm.geometry import ADD_FRACTIONS
 from slimsfm.graph import GraphOptions
-from slimsfm.localization import LocalizationOptions, calibration, round_result, verification
+from slimsfm.localization import LocalizationOptions, calibration, evidence, round_result
 from slimsfm.pose import RansacOptions
 from slimsfm.reduction import DominatingSetOptions, forecast
 from slimsfm.selection import information, problem
@@ -51,8 +51,8 @@ def test_a_number_matches_the_code(words, value):
 
 
 def test_numbers_in_words_match_the_code():
-    assert verification.UNAMBIGUOUS == 0.75  # three quarters of the inliers
-    assert verification.RIVAL_RANSAC.min_inliers == 6
+    assert evidence.UNAMBIGUOUS == 0.75  # three quarters of the inliers
+    assert evidence.RIVAL_RANSAC.min_inliers == 6
     assert round_result.MIN_REFUTING == 2
     assert RansacOptions().min_inliers == 12
     assert default(exact, "time_limit_s") == 60  # a minute

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from slimsfm.localization import verification
+from slimsfm.localization import evidence
 from slimsfm.mapping import camera_groups, choice, diagnosis, pair_subsets, parallax, quality, reconstruction
 from slimsfm.mapping import support as measured
 
@@ -36,7 +36,7 @@ PAGE = " ".join((Path(__file__).parents[2] / "docs" / "right-maps.md").read_text
         ("mean gray below {}", diagnosis._DARK),
         ("overexposed (above {})", diagnosis._BRIGHT),
         ("fewer than {} features", diagnosis._FEW),
-        ("{:.0%} of the [confidence]", verification._DOUBTED),
+        ("{:.0%} of the [confidence]", evidence._DOUBTED),
     ],
 )
 def test_the_limits_match_the_code(words, value):

@@ -10,11 +10,11 @@ from slimsfm.geometry import project
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.calibration import CALIBRATED, EVIDENCE_WEIGHTS, evidence_weights
 from slimsfm.localization.cameras import QueryCamera
+from slimsfm.localization.evidence import Evidence
 from slimsfm.localization.point_descriptors import describe_appearances, describe_points, viewing_directions
 from slimsfm.localization.round_result import RoundResult, suffices
 from slimsfm.localization.strategies import choose_landmarks
 from slimsfm.localization.strategy import PointMatches, Query
-from slimsfm.localization.verification import Evidence
 from slimsfm.mapping.map import GlobalDescriptors, observed
 from slimsfm.mapping.support import measure
 

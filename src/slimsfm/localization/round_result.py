@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import pycolmap
 
+from slimsfm.localization.evidence import Evidence
 from slimsfm.localization.strategy import PointMatches, Query
-from slimsfm.localization.verification import Evidence
 from slimsfm.pose import PoseEstimate
 
 SURE = 0.95
