@@ -15,6 +15,7 @@ from typing import Any, get_type_hints
 from slimsfm.errors import InputError
 from slimsfm.features.base import Extractor, Matcher, NearestOptions
 from slimsfm.files import plain, replacing
+from slimsfm.threads import waiting_without_spinning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,13 +222,14 @@ def export_method(method: str, path: Path, *, overwrite: bool = False) -> None:
 
 @contextmanager
 def importing(what: str) -> Iterator[None]:
-    """Turn a missing package into an error that names the extra to install.
+    """Turn a missing package into an error that names the extra to install; threads of packages do not spin.
 
     Raises:
         InputError: A package is missing.
     """
     try:
-        yield
+        with waiting_without_spinning():
+            yield
     except ModuleNotFoundError as error:
         raise InputError(
             f"{what} needs {error.name}, which is not installed: pip install 'slimsfm[learned]'"
