@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features, unmasked
+from slimsfm.features.brightness import brighten
 from slimsfm.photos import shrink
 
 _MOST_FEATURES = 1_000_000
@@ -24,7 +25,7 @@ _MOST_FEATURES = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class Sift:
-    """Extracts SIFT features."""
+    """Extracts SIFT features; dark images are brightened first."""
 
     max_features: int = 4096
     """Largest number of keypoints; those with the strongest contrast are kept."""
@@ -59,7 +60,8 @@ class Sift:
         """Extract features; the mask has the size of the image, and no feature lies where it is 0."""
         height, width = image.shape[:2]
         scale = min(1.0, self.max_image_size / max(height, width))
-        gray = shrink(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8), self.max_image_size)
+        gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+        gray = brighten(shrink(gray, self.max_image_size))
         small_mask = None if mask is None else shrink(mask, self.max_image_size)
         # OpenCV counts features before it applies the mask; with one, those to keep are chosen below.
         most = self.max_features if mask is None else 0

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from slimsfm.arrays import GrayImage, Image
 from slimsfm.features.base import Features
+from slimsfm.features.brightness import brighten
 from slimsfm.methods.keypoints import best_rows
 from slimsfm.photos import shrink
 
@@ -28,8 +29,8 @@ class NetworkInput:
 
 
 def network_input(image: Image, max_image_size: int, device: torch.device) -> NetworkInput:
-    """Shrink an image to a longer side of at most `max_image_size` pixels, and move it to a device."""
-    (height, width), small = image.shape[:2], shrink(image, max_image_size)
+    """Shrink an image to a longer side of at most `max_image_size` pixels, and brighten it if it is dark."""
+    (height, width), small = image.shape[:2], brighten(shrink(image, max_image_size))
     pixels = torch.from_numpy(np.ascontiguousarray(small)).to(device).permute(2, 0, 1)[None]
     return NetworkInput(
         pixels=pixels.to(torch.float32) / 255,
