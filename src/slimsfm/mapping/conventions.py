@@ -77,6 +77,9 @@ class MatchedRays:
     rays_b: Float64[np.ndarray, "n 3"]
     """Unit rays in the camera's frame of b."""
 
+    focal_px: float
+    """Focal length of b."""
+
 
 def check_convention(
     database: Path,
@@ -124,17 +127,35 @@ def agreement(pairs: list[MatchedRays], cam_from_world: Mapping[str, pycolmap.Ri
     return float(np.mean(shares)) if shares else 1.0
 
 
+def inexactness_px(pairs: list[MatchedRays], cam_from_world: Mapping[str, pycolmap.Rigid3d]) -> float:
+    """How far matches are from their epipolar planes, in pixels in the middle of the image; 0 without pairs.
+
+    The median over pairs of the median over matches.
+    """
+    medians = []
+    for one in pairs:
+        b_from_a = cam_from_world[one.b] * cam_from_world[one.a].inverse()
+        sines = _sines(one, b_from_a)
+        medians.append(one.focal_px * float(np.median(sines)))
+    medians = [median for median in medians if np.isfinite(median)]  # not of cameras in one place
+    return float(np.median(medians)) if medians else 0.0
+
+
+def _sines(pair: MatchedRays, b_from_a: pycolmap.Rigid3d) -> Float64[np.ndarray, " n"]:
+    """Sines of the angles between rays of b and the epipolar planes of their matches."""
+    turned = pair.rays_a @ b_from_a.rotation.matrix().T
+    normals = np.cross(b_from_a.translation, turned)
+    with np.errstate(all="ignore"):
+        return np.abs(np.sum(normals * pair.rays_b, axis=1)) / np.linalg.norm(normals, axis=1)
+
+
 def _agrees(pair: MatchedRays, b_from_a: pycolmap.Rigid3d) -> Bool[np.ndarray, " n"]:
     turned, rays_b, t = pair.rays_a @ b_from_a.rotation.matrix().T, pair.rays_b, b_from_a.translation
-    normals = np.cross(t, turned)
-    lengths = np.linalg.norm(normals, axis=1)
-    with np.errstate(all="ignore"):
-        sine = np.abs(np.sum(normals * rays_b, axis=1)) / lengths
     # the depths of the points of both rays that are nearest to each other, times something positive
     cosine = np.sum(turned * rays_b, axis=1)
     along_a, along_b = turned @ t, rays_b @ t
     in_front = (cosine * along_b - along_a > 0) & (along_b - cosine * along_a > 0)
-    return (sine < np.sin(np.radians(_TOLERANCE_DEG))) & in_front
+    return (_sines(pair, b_from_a) < np.sin(np.radians(_TOLERANCE_DEG))) & in_front
 
 
 def read_rays(database: Path, names: list[str]) -> list[MatchedRays]:
@@ -152,19 +173,25 @@ def read_rays(database: Path, names: list[str]) -> list[MatchedRays]:
         )
         ids = sorted({i for pair_id, _ in chosen for i in pycolmap.pair_id_to_image_pair(pair_id)})
         rays = {i: _read_rays(opened, i) for i in ids}
+        focal_px = {i: _camera(opened, i).mean_focal_length() for i in ids}
     made = []
     for pair_id, rows in chosen:
         a, b = pycolmap.pair_id_to_image_pair(pair_id)
         known = np.isfinite(rays[a][rows[:, 0]]).all(axis=1) & np.isfinite(rays[b][rows[:, 1]]).all(axis=1)
         if known.any():
             rays_a, rays_b = rays[a][rows[known, 0]], rays[b][rows[known, 1]]
-            made.append(MatchedRays(a=names[a - 1], b=names[b - 1], rays_a=rays_a, rays_b=rays_b))
+            both = {"a": names[a - 1], "b": names[b - 1], "rays_a": rays_a, "rays_b": rays_b}
+            made.append(MatchedRays(**both, focal_px=focal_px[b]))
     return made
 
 
 def _read_rays(database: pycolmap.Database, image_id: int) -> Float64[np.ndarray, "n 3"]:
-    camera = database.read_camera(database.read_image(image_id).camera_id)
+    camera = _camera(database, image_id)
     pixels: Points2D = np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
     rays = np.asarray(camera.cam_from_img(pixels), np.float64).reshape(-1, 2)
     rays = np.column_stack([rays, np.ones(len(rays))])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _camera(database: pycolmap.Database, image_id: int) -> pycolmap.Camera:
+    return database.read_camera(database.read_image(image_id).camera_id)

@@ -9,7 +9,7 @@ import pycolmap
 from threadpoolctl import threadpool_limits
 
 from slimsfm.geometry import rotation_error_deg
-from slimsfm.mapping.conventions import check_convention
+from slimsfm.mapping.conventions import check_convention, inexactness_px, read_rays
 from slimsfm.mapping.sfm import triangulate
 from slimsfm.mapping.work import KnownPoses
 from slimsfm.progress import ProgressBar, silent, single_step
@@ -17,6 +17,7 @@ from slimsfm.progress import ProgressBar, silent, single_step
 _ROUNDS = 2  # of adjusting the poses and triangulating again
 _SPREAD = 0.01  # standard deviation of a given center, over the distance of the centers from their mean
 _LOSS_PX = 1.0  # beyond which errors count less
+_EXACT_PX, _MOST_TOLERANT = 0.7, 2.0  # epipolar error with which COLMAP's limits are right; most times these
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,6 +46,9 @@ def triangulate_known(
     given camera centers are observations with a standard deviation of 1 % of their spread, which keeps frame
     and unit, also of parts of the model that share no point.
 
+    Poses of a file are as exact as the device that measured them. The less exact, by the matches, the larger
+    are the errors that points may have.
+
     Args:
         database: COLMAP's database with verified matches.
         names: Names of the images, which the database numbers from 1.
@@ -60,14 +64,21 @@ def triangulate_known(
     poses = {name: known.cam_from_world[name] for name in names}
     if known.convention is not None:
         check_convention(database, names, poses, known.convention, known.source)
-    model = triangulate(database, names, workspace, poses, seed=seed, progress=progress)
+    is_measured = known.convention is not None or known.refine
+    pairs = read_rays(database, names) if is_measured else []
+
+    def triangulated(poses: Mapping[str, pycolmap.Rigid3d]) -> pycolmap.Reconstruction:
+        tolerance = min(max(1.0, inexactness_px(pairs, poses) / _EXACT_PX), _MOST_TOLERANT)
+        common = {"seed": seed, "progress": progress, "tolerance": tolerance}
+        return triangulate(database, names, workspace, poses, **common)
+
+    model, refined = triangulated(poses), poses
     if not known.refine:
         return KnownModel(model=model)
-    refined = poses
     for _ in range(_ROUNDS):
         with single_step(progress, "adjust poses"):
             refined = _adjusted(model, poses)
-        model = triangulate(database, names, workspace, refined, seed=seed, progress=progress)
+        model = triangulated(refined)
     return KnownModel(model=model, notes=(_moved(poses, refined),))
 
 

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pycolmap
+
 from slimsfm.mapping.known_poses.given import COLMAP, GivenPoses
 from slimsfm.mapping.model import camera_of, read_model
 
@@ -25,7 +27,7 @@ def read(path: Path) -> GivenPoses:
         source=path,
         key="name",
         cam_from_world={image.name: image.cam_from_world() for image in images},
-        cameras={image.name: camera_of(image) for image in images},
+        cameras={image.name: pycolmap.Camera(camera_of(image).todict()) for image in images},  # outlive it
         folder=path,
         convention=COLMAP,
         unit="unknown",

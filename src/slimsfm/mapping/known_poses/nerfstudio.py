@@ -47,20 +47,20 @@ class _Intrinsics:
 
     camera_model: str | None = None
     is_fisheye: bool = False
-    w: float = 0
-    h: float = 0
+    w: float = 0.0
+    h: float = 0.0
     fl_x: float | None = None
     fl_y: float | None = None
     camera_angle_x: float | None = None
     camera_angle_y: float | None = None
     cx: float | None = None
     cy: float | None = None
-    k1: float = 0
-    k2: float = 0
-    k3: float = 0
-    k4: float = 0
-    p1: float = 0
-    p2: float = 0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
 
     def camera(self, source: str) -> pycolmap.Camera:
         """The camera.
@@ -87,7 +87,7 @@ class _Intrinsics:
             what = "distortion k4" if name in _PERSPECTIVE else f"camera_model {name}"
             raise InputError(f"{source}: {what} is not supported; undistort the images to PINHOLE first")
         if self.k3:
-            return "FULL_OPENCV", [self.k1, self.k2, self.p1, self.p2, self.k3, 0, 0, 0]
+            return "FULL_OPENCV", [self.k1, self.k2, self.p1, self.p2, self.k3, 0.0, 0.0, 0.0]
         distortion = [self.k1, self.k2, self.p1, self.p2]
         return ("OPENCV", distortion) if any(distortion) else ("PINHOLE", [])
 
