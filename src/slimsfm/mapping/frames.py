@@ -56,7 +56,7 @@ def extract_frames(
     video: str | Path,
     folder: str | Path,
     *,
-    fps: float = FRAMES_PER_SECOND,
+    fps: float | int = FRAMES_PER_SECOND,
     strict: bool = False,
     progress: ProgressBar = silent,
 ) -> ChosenFrames:
@@ -121,7 +121,7 @@ class _Pictures:
             advance_to(total)
 
 
-def _candidates(pictures: Iterator[tuple[int, float, Image]], fps: float) -> Iterator[_Candidate]:
+def _candidates(pictures: Iterator[tuple[int, float, Image]], fps: float | int) -> Iterator[_Candidate]:
     """The sharpest frame of each window; a window starts half an interval after the last candidate."""
     start = end = best = None
     for index, seconds, image in pictures:

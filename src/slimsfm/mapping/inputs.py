@@ -67,7 +67,7 @@ def gather_photos(
     sources: Sequence[Path],
     workspace: Path,
     *,
-    fps: float = FRAMES_PER_SECOND,
+    fps: float | int = FRAMES_PER_SECOND,
     strict: bool = False,
     progress: ProgressBar = silent,
 ) -> GatheredPhotos:
@@ -142,7 +142,7 @@ def _named(sources: Sequence[Path]) -> dict[str, Path]:
 
 
 def _frames(
-    video: Path, name: str, workspace: Path, *, fps: float, strict: bool, progress: ProgressBar
+    video: Path, name: str, workspace: Path, *, fps: float | int, strict: bool, progress: ProgressBar
 ) -> ChosenFrames:
     """Choose the frames of a video, unless an interrupted build has done so."""
     folder, record, found = workspace / _PHOTOS / name, workspace / _VIDEOS / f"{name}.json", video.stat()
