@@ -96,7 +96,8 @@ def build_map(
         try:
             parts = _build(work, extracted, extractor, options)
         except ReconstructionError as error:  # what was skipped may be the reason
-            raise ReconstructionError("; ".join([str(error), *notes, *photos.notes])) from error
+            said = str(error).replace(str(folder_of_photos), chosen.label)
+            raise ReconstructionError("; ".join([said, *notes, *photos.notes])) from error
     notes = (*notes, *photos.notes, *(parts.picked.notes if parts.picked else ()), *parts.notes)
     return with_global_descriptors(_map(parts, work, exifs, given_box, notes, options))
 

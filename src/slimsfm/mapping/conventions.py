@@ -113,8 +113,9 @@ def check_convention(
     best = max(shares, key=lambda one: shares[one])
     if shares[best] >= max(given + _CLEARLY, _TIMES * given):
         raise InputError(
-            f"{source}: its matrices were read as {convention}, with which {given:.0%} of the matches agree "
-            f"and put points before the cameras; {shares[best]:.0%} do if they are {best}: convert the poses"
+            f"{source}: its matrices were read as {convention}, but only {given:.0%} of the matches agree "
+            f"with that and lie in front of the cameras; {shares[best]:.0%} do if they are {best}; convert "
+            "the poses"
         )
 
 

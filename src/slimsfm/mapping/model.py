@@ -210,7 +210,7 @@ def _is_place(model: pycolmap.Reconstruction, box: Box) -> bool:
     return bool(stand_in >= _MOST and look_alike < _MOST and look_inward < _MOST)
 
 
-def _place_box(box: Box, points: Points3D, centers: Points3D) -> Box:
+def _place_box(box: Box, points: Points3D, centers: Float64[np.ndarray, "_ 3"]) -> Box:
     axes = box.half_edges / np.linalg.norm(box.half_edges, axis=1, keepdims=True)
     ends = [_TAIL, 1 - _TAIL]
     low_high = np.stack([np.quantile(one @ axes.T, ends, axis=0) for one in (points, centers)])

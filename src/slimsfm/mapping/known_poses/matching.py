@@ -88,31 +88,46 @@ def _equal_parts(a: Sequence[str], b: Sequence[str]) -> int:
 def _by_time(given: GivenPoses, photos: PhotosToPose) -> dict[str, str]:
     keys = sorted(given.cam_from_world, key=float)
     times = np.array([float(key) for key in keys])
-    stems = {name: _number(PurePosixPath(name).stem) for name in photos.names}
-    if all(name in photos.seconds for name in photos.names):
-        seconds = dict(photos.seconds)
-    elif all(number is not None for number in stems.values()):
-        seconds = _in_seconds({name: number for name, number in stems.items() if number is not None}, times)
-    elif np.array_equal(times, times.round()) and times.min() >= 0 and times.max() < len(photos.names):
-        return dict(zip((in_order(photos.names)[int(time)] for time in times), keys, strict=True))
-    else:
-        timeless = next(name for name, number in stems.items() if number is None)
-        raise InputError(
-            f"{given.source}: its poses have times, but the name of the photo {timeless} is none; name the "
-            "photos by their times"
-        )
+    seconds = _seconds(photos, times)
+    if seconds is None:
+        return _by_index(given, photos, dict(zip(times.tolist(), keys, strict=True)))
     names = sorted(photos.names, key=lambda name: (seconds[name], name))
     at = np.array([seconds[name] for name in names])
-    steps = [float(np.median(np.diff(one))) / 2 for one in (at, times) if len(one) > 1]
     nearest = np.abs(times[None] - at[:, None]).argmin(axis=1)
     off = np.abs(times[nearest] - at)
-    within = off <= max(min(steps, default=0.0), 0.0) if steps else off <= _ANY_S
     best: dict[int, int] = {}  # photo by pose: the nearest one
-    for row in np.flatnonzero(within).tolist():
+    for row in np.flatnonzero(off <= _half_a_frame(at, times)).tolist():
         pose = int(nearest[row])
         if pose not in best or off[row] < off[best[pose]]:
             best[pose] = row
     return {names[row]: keys[pose] for pose, row in best.items()}
+
+
+def _seconds(photos: PhotosToPose, times: np.ndarray) -> dict[str, float] | None:
+    """When each photo was taken, by name; None if that is not known of all."""
+    if all(name in photos.seconds for name in photos.names):
+        return {name: photos.seconds[name] for name in photos.names}
+    numbers = {name: _number(PurePosixPath(name).stem) for name in photos.names}
+    known = {name: number for name, number in numbers.items() if number is not None}
+    return _in_seconds(known, times) if len(known) == len(numbers) else None
+
+
+def _by_index(given: GivenPoses, photos: PhotosToPose, keys: Mapping[float, str]) -> dict[str, str]:
+    """Times that are the order of the photos."""
+    names = in_order(photos.names)
+    if all(time.is_integer() and 0 <= time < len(names) for time in keys):
+        return {names[int(time)]: key for time, key in keys.items()}
+    timeless = next(name for name in names if _number(PurePosixPath(name).stem) is None)
+    raise InputError(
+        f"{given.source}: its poses have times, but the name of the photo {timeless} is none; name the "
+        "photos by their times"
+    )
+
+
+def _half_a_frame(at: np.ndarray, times: np.ndarray) -> float:
+    """Half the distance of photos or of poses in time, whichever is less."""
+    steps = [float(np.median(np.diff(one))) / 2 for one in (at, times) if len(one) > 1]
+    return min(steps, default=_ANY_S)
 
 
 def _number(text: str) -> float | None:
