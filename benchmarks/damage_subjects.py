@@ -14,8 +14,9 @@ from slimsfm.features import Features
 from slimsfm.geometry import corner_error
 from slimsfm.graph.io import read_given_graph
 from slimsfm.localization import LocalizationOptions, Localizer
-from slimsfm.localization.cameras import query_camera, read_camera, read_gravity
+from slimsfm.localization.cameras import query_camera, read_gravity
 from slimsfm.mapping import ImportOptions, Map, import_colmap, read_map
+from slimsfm.mapping.camera_file import read_camera
 from slimsfm.mapping.model import read_box
 from slimsfm.photos import read_photo
 from slimsfm.pose import PoseEstimate

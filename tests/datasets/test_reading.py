@@ -3,8 +3,9 @@ import pytest
 from PIL import Image
 
 from slimsfm.datasets.base import largest_distance
-from slimsfm.datasets.reading import folders, image_size, numbered, pinhole_camera, rigid
+from slimsfm.datasets.reading import folders, image_size
 from slimsfm.errors import InputError
+from slimsfm.mapping.known_poses.values import numbered, pinhole_camera, rigid
 from slimsfm.synthetic.scene import mapping_path
 
 SIDEWAYS = 6  # EXIF's orientation of a photo taken upright

@@ -1,4 +1,5 @@
 import importlib.util
+import json
 import shutil
 import sys
 import tomllib
@@ -6,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
@@ -16,7 +18,7 @@ from slimsfm.mapping.build import build_map
 from slimsfm.mapping.hloc import write_hloc
 from slimsfm.mapping.io import write_map
 from slimsfm.mapping.map import Map
-from slimsfm.synthetic.scene import mapping_take
+from slimsfm.synthetic.scene import Take, mapping_take
 from slimsfm.tracking.video import write_video
 
 ROOT = Path(__file__).parents[2]
@@ -46,10 +48,25 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with write_video(folder / "video.mp4", FRAMES_PER_SECOND) as write:
         for frame in frames:
             write(frame)
+    _write_transforms(folder / "transforms.json", take)
     focal, *center = take.camera.params[1:]
     (folder / "camera.txt").write_text(f"1 PINHOLE 320 240 {focal} {focal} {' '.join(map(str, center))}\n")
     shutil.copytree(ROOT / "examples" / "own_matcher", folder / "own_matcher")
     return folder
+
+
+def _write_transforms(path: Path, take: Take) -> None:
+    """The poses of the photos in nerfstudio's format."""
+    matrix = take.camera.calibration_matrix()
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = []
+    for index in range(0, FRAMES, 2):
+        world_from_cam = np.vstack([take.cam_from_object[index].inverse().matrix(), [0, 0, 0, 1]])
+        matrix = (world_from_cam @ turned).tolist()
+        frames.append({"file_path": f"photos/{index:02d}.png", "transform_matrix": matrix})
+    camera = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 320, "h": 240}
+    path.write_text(json.dumps(camera | {"frames": frames}))
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,9 @@ from scenes import camera
 from slimsfm.errors import ImageError, InputError
 from slimsfm.exif import camera_from_exif
 from slimsfm.geometry import project
-from slimsfm.localization.cameras import FocalLength, guess_camera, query_camera, read_camera
+from slimsfm.localization.cameras import FocalLength, guess_camera, query_camera
 from slimsfm.localization.map_cameras import scaled_camera
+from slimsfm.mapping.camera_file import read_camera
 
 
 def photo(path, size=(640, 480), focal_35mm=None):

@@ -9,6 +9,7 @@ from scenes import BOX, camera, poses
 from slimsfm.errors import InputError
 from slimsfm.geometry import Box, project
 from slimsfm.mapping.model import estimate_box, read_box
+from slimsfm.synthetic.scene import look_at
 
 
 def write_json(path, value):
@@ -123,3 +124,40 @@ def test_the_box_of_flat_points_has_some_thickness():
     box = estimate_box(model)
     assert np.linalg.norm(box.half_edges, axis=1).min() > 0
     assert box.diagonal == pytest.approx(2 * np.hypot(1, 0.8), rel=0.1)
+
+
+def room(num_cameras, look_out):
+    """A room of 6 by 4 by 2.5 units with cameras on a ring in its middle, and some points far outside."""
+    rng = np.random.default_rng(0)
+    walls = rng.uniform(-1, 1, (1500, 3))
+    walls[np.arange(1500), rng.integers(0, 2, 1500)] = rng.choice([-1.0, 1.0], 1500)
+    points = np.concatenate([walls * [3, 2, 1.25], rng.uniform(-40, 40, (15, 3))])
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera())
+    tracks = [pycolmap.Track() for _ in points]
+    for image_id in range(1, num_cameras + 1):
+        angle = 2 * np.pi * image_id / num_cameras
+        center = 0.5 * np.array([np.cos(angle), np.sin(angle), 0])
+        pose = look_at(center, center * (3 if look_out else -1))
+        pixels = project(points, pose, camera())
+        seen = np.flatnonzero(np.all((pixels > 0) & (pixels < (640, 480)), axis=1))
+        image = pycolmap.Image(name=f"{image_id}.png", keypoints=pixels[seen], camera_id=1, image_id=image_id)
+        model.add_image_with_trivial_frame(image, pose)
+        for row, point in enumerate(seen):
+            tracks[point].add_element(image_id, row)
+    for point, track in zip(points, tracks, strict=True):
+        if track.length() >= 2:
+            model.add_point3D(point, track, np.zeros(3, np.uint8))
+    return model
+
+
+def test_the_box_of_a_place_is_that_of_what_is_seen_around_the_cameras():
+    model = room(40, look_out=True)
+    box = estimate_box(model)
+    lengths = np.sort(2 * np.linalg.norm(box.half_edges, axis=1))
+    assert lengths == pytest.approx([2.5, 4, 6], rel=0.25)
+    offsets = [
+        np.linalg.solve(box.half_edges.T, model.image(i).projection_center() - box.center)
+        for i in range(1, 41)
+    ]
+    assert np.abs(offsets).max() < 1

@@ -11,7 +11,7 @@ from PIL import Image
 from commands import contents
 from exif_photos import STORED, save_photo
 from slimsfm.errors import ImageError, InputError, OutputError, VideoError
-from slimsfm.tracking.film import with_square_pixels
+from slimsfm.film import with_square_pixels
 from slimsfm.tracking.video import VIDEO_FORMATS, open_frames, write_video
 
 

@@ -21,8 +21,9 @@ from slimsfm.localization import (
     localize_images,
     localize_objects,
 )
-from slimsfm.localization.cameras import read_camera, read_gravity
+from slimsfm.localization.cameras import read_gravity
 from slimsfm.localization.pose_files import check_names_for, write_object_poses, write_poses, writer_for
+from slimsfm.mapping.camera_file import read_camera
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import shown
 

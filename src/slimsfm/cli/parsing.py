@@ -123,7 +123,7 @@ def _parser_of(options: Sequence[Option]) -> ArgumentParser:
             parser.add_argument(*option.flags, action="store_true", **names)
             continue
         if get_origin(kind) is tuple:
-            kind, names["nargs"] = get_args(kind)[0], "*"
+            kind, names["nargs"] = get_args(kind)[0], "*" if option.flags else "+"
         choices = get_args(kind) if get_origin(kind) is Literal else None
         reader = _read_truth if kind is bool else str if choices else kind
         parser.add_argument(*(option.flags or (key,)), type=reader, choices=choices, **names)

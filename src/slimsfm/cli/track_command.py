@@ -8,8 +8,8 @@ from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, Argument, MapPath, OutputPath
 from slimsfm.cli.output import Stopwatch, check_output, console, finish, plural
 from slimsfm.localization import Localization, LocalizationOptions, Localizer
-from slimsfm.localization.cameras import read_camera
 from slimsfm.localization.pose_files import write_poses, writer_for
+from slimsfm.mapping.camera_file import read_camera
 from slimsfm.mapping.io import read_map
 from slimsfm.progress import counted, shown
 from slimsfm.report.tracked_video import track_video

@@ -8,7 +8,8 @@ from slimsfm.cli.arguments import Networks, Reading
 from slimsfm.cli.options import Advanced, MapPath
 from slimsfm.cli.output import console, print_warnings
 from slimsfm.errors import InputError
-from slimsfm.localization.cameras import FocalLength, read_camera
+from slimsfm.localization.cameras import FocalLength
+from slimsfm.mapping.camera_file import read_camera
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.progress import shown
 

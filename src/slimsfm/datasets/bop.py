@@ -38,16 +38,9 @@ from slimsfm.datasets.base import (
     PosedSequence,
     read_object_model,
 )
-from slimsfm.datasets.reading import (
-    check_frame_step,
-    check_object_name,
-    folders,
-    image_size,
-    pinhole_camera,
-    read_json,
-    rigid,
-)
+from slimsfm.datasets.reading import check_frame_step, check_object_name, folders, image_size, read_json
 from slimsfm.errors import InputError
+from slimsfm.mapping.known_poses.values import pinhole_camera, rigid
 
 _SUFFIXES = (".png", ".jpg", ".tif")
 _LEAST_VISIBLE = 0.1

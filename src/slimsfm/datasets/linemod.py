@@ -25,17 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from slimsfm.datasets.base import ListedModel, LoadOptions, ObjectSequences, PosedSequence, read_object_model
-from slimsfm.datasets.reading import (
-    check_object_name,
-    check_paired,
-    equal_size,
-    folders,
-    numbered,
-    pinhole_camera,
-    read_pose,
-    read_text,
-)
+from slimsfm.datasets.reading import check_object_name, check_paired, equal_size, folders
 from slimsfm.errors import ImageError, InputError
+from slimsfm.mapping.known_poses.values import numbered, pinhole_camera, read_pose, read_text
 
 _NUMBERS = {
     "ape": 1,

@@ -44,7 +44,6 @@ from typing import Literal
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
 
 from slimsfm.datasets.base import (
     LoadOptions,
@@ -55,21 +54,23 @@ from slimsfm.datasets.base import (
     read_object_model,
 )
 from slimsfm.datasets.reading import (
-    PIXEL_CENTER,
     check_frame_step,
     check_object_name,
     check_paired,
     equal_size,
     folders,
     image_size,
+)
+from slimsfm.errors import InputError
+from slimsfm.geometry import Box
+from slimsfm.mapping.known_poses.onepose import read_intrinsics
+from slimsfm.mapping.known_poses.values import (
+    PIXEL_CENTER,
     numbered,
     pinhole_camera,
     read_matrix,
     read_pose,
-    read_text,
 )
-from slimsfm.errors import InputError
-from slimsfm.geometry import Box
 from slimsfm.mapping.model import read_box
 
 FrameKind = Literal["full", "cropped"]
@@ -215,7 +216,7 @@ def _cameras_of_full_frames(
 ) -> tuple[pycolmap.Camera, ...]:
     path = directory / "intrinsics.txt"
     size = equal_size([images[number] for number in chosen])
-    return (pinhole_camera(_read_intrinsics(path), size, path),) * len(chosen)
+    return (pinhole_camera(read_intrinsics(path), size, path),) * len(chosen)
 
 
 def _cameras_of_crops(
@@ -227,17 +228,6 @@ def _cameras_of_crops(
         pinhole_camera(read_matrix(matrices[number], (3,), 3), image_size(images[number]), matrices[number])
         for number in chosen
     )
-
-
-def _read_intrinsics(path: Path) -> Float64[np.ndarray, "3 3"]:
-    found = dict(re.findall(r"^(fx|fy|cx|cy):\s*(\S+)\s*$", read_text(path), flags=re.MULTILINE))
-    try:
-        fx, fy, cx, cy = (float(found[key]) for key in ("fx", "fy", "cx", "cy"))
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"{path} must have the lines fx: ..., fy: ..., cx: ..., cy: ..., each a number"
-        ) from error
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def image_path(sequence: Path, number: int) -> Path:

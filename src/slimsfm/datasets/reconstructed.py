@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slimsfm.datasets.base import TWO_VIEWS, LoadOptions, ObjectSequences, PosedSequence
-from slimsfm.datasets.reading import check_object_name, image_size, read_text
+from slimsfm.datasets.reading import check_object_name, image_size
 from slimsfm.errors import ImageError, InputError
 from slimsfm.files import inside
 from slimsfm.image_files import find_images, is_image, list_images
 from slimsfm.mapping.build import build_map
 from slimsfm.mapping.importing import ImportOptions, import_colmap
 from slimsfm.mapping.io import read_map, write_map
+from slimsfm.mapping.known_poses.values import read_text
 from slimsfm.mapping.map import Map
 
 _LOGGER = logging.getLogger(__name__)

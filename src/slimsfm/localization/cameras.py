@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 
-from slimsfm.errors import ImageError, InputError
+from slimsfm.errors import ImageError
 from slimsfm.exif import Exif, read_exif
-from slimsfm.files import contents_of, plain, read_json, read_text
+from slimsfm.files import contents_of, plain, read_json
 from slimsfm.lenses import camera_fault
 from slimsfm.localization.map_cameras import camera_by_exif, camera_of_size, scaled_camera, zoomed_camera
 from slimsfm.mapping.map import Map
@@ -51,30 +51,6 @@ class QueryCamera:
     def __post_init__(self) -> None:
         if fault := camera_fault(self.camera):
             raise ValueError(f"camera must be possible, but {fault}")
-
-
-def read_camera(path: str | Path) -> pycolmap.Camera:
-    """Read the one camera of a file in COLMAP's `cameras.txt` format: `ID MODEL WIDTH HEIGHT PARAMS...`.
-
-    Raises:
-        InputError: The file is missing, does not hold exactly one camera, or an impossible one.
-    """
-    path = Path(path)
-    with contents_of(path, "not a readable camera file"):
-        lines = [line.split() for line in read_text(path).splitlines()]
-    cameras = [words for words in lines if words and not words[0].startswith("#")]
-    try:
-        (camera,) = cameras
-        camera_id, model, width, height, *params = camera
-        read = pycolmap.Camera.create_from_model_name(int(camera_id), model, 1.0, int(width), int(height))
-        read.params = [float(p) for p in params]
-    except (ValueError, TypeError, RuntimeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: should hold one line `ID MODEL WIDTH HEIGHT PARAMS...` as in COLMAP's cameras.txt"
-        ) from error
-    if fault := camera_fault(read):
-        raise InputError(f"{path}: the camera is impossible: {fault}; correct the line or calibrate it again")
-    return read
 
 
 def guess_camera(width: int, height: int) -> pycolmap.Camera:

@@ -1,6 +1,6 @@
 """Build maps from photos by Structure from Motion."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import cast
 from slimsfm.devices import Device
 from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.execution import OpenExecutor
-from slimsfm.exif import Exif, ignored_values, read_device, read_exif, read_orientation
+from slimsfm.exif import Exif, ignored_values, read_device, read_orientation
 from slimsfm.features import Extractor, load_extractor
 from slimsfm.files import working_folder
 from slimsfm.geometry import Box
@@ -18,10 +18,12 @@ from slimsfm.mapping.cameras import devices_by_camera
 from slimsfm.mapping.descriptors import with_global_descriptors
 from slimsfm.mapping.extraction import Extracted, check_readable, extract_features, guess_cameras
 from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.inputs import InputOptions
 from slimsfm.mapping.keypoint_model import build_from_keypoints
 from slimsfm.mapping.map import Map
-from slimsfm.mapping.masked_photos import MaskedPhotos, find_photos
+from slimsfm.mapping.masked_photos import MaskedPhotos
 from slimsfm.mapping.model import estimate_box, read_box
+from slimsfm.mapping.photo_choice import check_enough, choose_photos
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.sfm import colmap_warnings
 from slimsfm.mapping.support import measure
@@ -32,80 +34,72 @@ from slimsfm.skipping import SkippedPhotos
 
 
 def build_map(
-    images: str | Path,
+    images: str | Path | Sequence[str | Path],
     options: BuildOptions = BuildOptions(),
     *,
+    inputs: InputOptions = InputOptions(),
     known: KnownPoses | None = None,
     workspace: str | Path | None = None,
     open_executor: OpenExecutor | None = None,
     progress: ProgressBar = silent,
     min_seconds: float = Workers.min_seconds,
 ) -> Map:
-    """Build a map from a folder of photos by Structure from Motion.
+    """Build a map from photos and videos by Structure from Motion.
 
-    Photos that cannot be read are skipped with a warning, unless `BuildOptions.strict` is set. Photos that
-    could not be registered are named in `Map.unregistered`, and what was skipped or ignored in
-    `MapInfo.notes`. The map reads its features from disk when they are needed, so that large maps fit into
-    memory.
+    Photos that cannot be read are skipped with a warning, and a video that is cut off is used until there,
+    unless `BuildOptions.strict` is set. Photos that could not be registered are named in `Map.unregistered`,
+    and what was skipped or ignored in `MapInfo.notes`. The map reads its features from disk when they are
+    needed, so that large maps fit into memory.
 
     Args:
-        images: Folder. All images in it and its subfolders are used or, with known poses, those with a pose.
+        images: Folder of photos, video, or several of either. All images in a folder and its subfolders are
+            used or, with known poses, those with a pose. See `gather_photos` for the names of several.
         options: How to build.
-        known: Known poses: points are triangulated and nothing else is estimated.
-        workspace: Folder that keeps the intermediate files: COLMAP's database, model and the features. An
-            equal call goes on from those that an interrupted one left; another call starts afresh. By
-            default a temporary folder that is removed. Workers open it.
+        inputs: How frames of videos are chosen, and a file of known poses.
+        known: Known poses, in Python: points are triangulated from them as from those of a file.
+        workspace: Folder that keeps the intermediate files: frames of videos, COLMAP's database, model and
+            the features. An equal call goes on from those that an interrupted one left; another call starts
+            afresh. By default a temporary folder that is removed. Workers open it.
         open_executor: Opens the executor that extracts and matches features; None: this process. The map has
             equal bytes in any case.
         progress: Progress callback.
         min_seconds: As in `Workers`.
 
     Raises:
-        InputError: The folder, a mask or the box cannot be used, or fewer than two images can.
+        InputError: A folder, a video, a mask, the poses or the box cannot be used, or fewer than two images
+            can; or the matches say that the poses were read in the wrong convention.
+        VideoError: With `strict`, a video cannot be read to its end.
         ReconstructionError: The images give no model.
     """
-    images = Path(images)
-    found = None if known else find_photos(images, options.masks)
-    names = list(found.names) if found else sorted(known.cam_from_world if known else ())
-    notes = found.notes if found else ()
-    _check_enough(images, names, notes)
-    workers = Workers(open_executor=open_executor, min_seconds=min_seconds)
+    if known is not None and inputs.poses is not None:
+        raise ValueError("known poses are given twice, as known and as inputs.poses")
+    sources = [Path(images)] if isinstance(images, str | Path) else [Path(one) for one in images]
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
-    photos = MaskedPhotos(images, names, options.masks, options.alpha, options.orientation)
-    skipped = SkippedPhotos(images, strict=options.strict)
-    exifs = {} if known else _read_exifs(images, names, skipped)
-    guess_cameras(exifs, options.camera, options.orientation)  # fails before the long work
+    workers = Workers(open_executor=open_executor, min_seconds=min_seconds)
     with _opened(workspace) as folder, colmap_warnings():
-        space = Workspace(folder, build_key(images, names, photos, extractor, options, known))
-        extracted = _extract(photos, skipped.left(names), extractor, space, skipped, workers, progress)
-        names = skipped.left(names)
-        notes = (*notes, *skipped.notes)
-        _check_enough(images, names, notes)
+        chosen = choose_photos(sources, folder, options, inputs, known, progress)
+        known, skipped, exifs, folder_of_photos = chosen.known, chosen.skipped, chosen.exifs, chosen.folder
+        photos = MaskedPhotos(
+            folder_of_photos, chosen.names, options.masks, options.alpha, options.orientation
+        )
+        key = build_key(folder_of_photos, chosen.names, photos, extractor, options, known)
+        space = Workspace(folder, key)
+        extracted = _extract(photos, skipped.left(chosen.names), extractor, space, skipped, workers, progress)
+        names = skipped.left(chosen.names)
+        notes = (*chosen.notes, *skipped.notes)
+        check_enough(chosen.label, names, notes)
         photos.keep(names)
         exifs = {name: exifs[name] for name in names} if exifs else {}
-        work = _work(images, photos, names, space, exifs, known, options, workers, progress)
+        work = _work(folder_of_photos, photos, names, space, exifs, known, options, workers, progress)
         notes = (*notes, *ignored_values(exifs))
         try:
             parts = _build(work, extracted, extractor, options)
         except ReconstructionError as error:  # what was skipped may be the reason
-            raise ReconstructionError("; ".join([str(error), *notes, *photos.notes])) from error
-    notes = (*notes, *photos.notes, *(parts.picked.notes if parts.picked else ()))
+            said = str(error).replace(str(folder_of_photos), chosen.label)
+            raise ReconstructionError("; ".join([said, *notes, *photos.notes])) from error
+    notes = (*notes, *photos.notes, *(parts.picked.notes if parts.picked else ()), *parts.notes)
     return with_global_descriptors(_map(parts, work, exifs, given_box, notes, options))
-
-
-def _check_enough(images: Path, names: list[str], notes: tuple[str, ...]) -> None:
-    if len(names) < 2:
-        few = f"{images}: holds {len(names)} image{'s' * (not names)}; a map needs at least two"
-        raise InputError("; ".join([few, *notes]))
-
-
-def _read_exifs(images: Path, names: list[str], skipped: SkippedPhotos) -> dict[str, Exif]:
-    exifs = {}
-    for name in names:
-        with skipped.skipping(name):
-            exifs[name] = read_exif(images / name)
-    return exifs
 
 
 def _extract(
@@ -154,6 +148,8 @@ def _build(
 ) -> MapParts:
     if extracted is not None:
         return build_from_keypoints(work, extracted, extractor, options)
+    if work.known and work.known.refine:
+        raise InputError(f"{options.extractor} finds no keypoints, without which poses cannot be refined")
     if work.turned and options.camera == "shared":
         raise InputError(
             f"{min(work.turned)}: width and height are swapped, and without a detector such images cannot "

@@ -4,19 +4,17 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import pycolmap
-
 from slimsfm.errors import ReconstructionError
 from slimsfm.features import Extractor, Features, load_matcher, runs_on_one_core
 from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.diagnosis import diagnose
 from slimsfm.mapping.extraction import Extracted, color_points
+from slimsfm.mapping.known_model import triangulate_known
 from slimsfm.mapping.matching import PairMatching, match_and_verify
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
 from slimsfm.mapping.pairs import choose_pairs, unsure_pairs
 from slimsfm.mapping.reconstruction import reconstruct
 from slimsfm.mapping.scratch import put_keypoints, verified_matches, write_database, write_geometries
-from slimsfm.mapping.sfm import triangulate
 from slimsfm.mapping.shrinking import ShrunkImages
 from slimsfm.mapping.work import BuildOptions, BuildWork, MapParts
 from slimsfm.mapping.workspace import DATABASE, FEATURES, SFM
@@ -37,8 +35,14 @@ def build_from_keypoints(
     sideways = TurnedFeatures(features, _turns(work))
     shrunk = ShrunkImages.by_extractor(sideways, {**work.cameras, **work.turned}, extractor.options)
     database = _match(work, features, shrunk, options)
-    picked = _reconstruct(work, database, shrunk, options) if work.known is None else None
-    model = picked.model if picked else _triangulate(work, database, options)
+    picked, notes = None, ()
+    if work.known is None:
+        picked = _reconstruct(work, database, shrunk, options)
+        model = picked.model
+    else:
+        sfm, seed = work.workspace.folder / SFM, options.seed
+        posed = triangulate_known(database, work.names, sfm, work.known, seed=seed, progress=work.progress)
+        model, notes = posed.model, posed.notes
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     shrunk.enlarge(model, known_cameras=work.known is not None)
     if work.turned:
@@ -46,17 +50,13 @@ def build_from_keypoints(
         model = turned_model(model, turns_back)
         put_keypoints(model, features)
     color_points(model, extracted.colors)
-    return MapParts(extractor=extractor, model=model, features=features, matches=matches, picked=picked)
+    return MapParts(
+        extractor=extractor, model=model, features=features, matches=matches, picked=picked, notes=notes
+    )
 
 
 def _turns(work: BuildWork) -> dict[str, int]:
     return dict.fromkeys(work.turned, 1)
-
-
-def _triangulate(work: BuildWork, database: Path, options: BuildOptions) -> pycolmap.Reconstruction:
-    poses = work.known.cam_from_world if work.known else {}
-    sfm = work.workspace.folder / SFM
-    return triangulate(database, work.names, sfm, poses, seed=options.seed, progress=work.progress)
 
 
 def _reconstruct(work: BuildWork, database: Path, shrunk: ShrunkImages, options: BuildOptions) -> PickedModel:

@@ -139,6 +139,8 @@ _ROUNDS = 50  # of trimming; it converges in fewer
 _REACH = 2.0  # points beyond this many times the root mean square distance are background
 _SPREAD = 0.25  # of the Gaussian, over the shorter side of the image
 _TAIL = 0.01  # share of the weight outside either end of the box
+_MOST = 0.5  # of the cameras, and length of the mean of unit vectors, in a place
+_OFTEN = 3  # images that see a point of a place
 
 
 def read_box(path: str | Path) -> Box:
@@ -159,7 +161,7 @@ def read_box(path: str | Path) -> Box:
 
 
 def estimate_box(model: pycolmap.Reconstruction) -> Box:
-    """Estimate the box of the object that the images look at.
+    """Estimate the box of the object that the images look at, or of the place that they were taken in.
 
     The weight of a point grows with the number of its observations and with how close they are to the image
     centers. Points farther from the weighted mean than twice the root mean square distance are background;
@@ -167,6 +169,10 @@ def estimate_box(model: pycolmap.Reconstruction) -> Box:
     and leaves out 1 % of their weight at each of its sides.
 
     With masks, all features and points lie on the object, and the same rule works.
+
+    If most cameras stand in this box and look apart and not at each other's middle, it is the box of a place:
+    it has the same axes and holds the points that at least three images see and the cameras, without 1 % of
+    either at each of its sides.
     """
     ids = sorted(model.point3D_ids())
     points = np.array([model.point3D(i).xyz for i in ids], np.float64).reshape(-1, 3)
@@ -179,7 +185,37 @@ def estimate_box(model: pycolmap.Reconstruction) -> Box:
         if np.array_equal(kept, inside):
             break
         inside = kept
-    return _box_around(points[inside], weights[inside])
+    box = _box_around(points[inside], weights[inside])
+    if not _is_place(model, box):
+        return box
+    often = np.array([model.point3D(i).track.length() for i in ids]) >= _OFTEN
+    return _place_box(box, points[often] if often.sum() >= _OFTEN else points, _centers(model))
+
+
+def _centers(model: pycolmap.Reconstruction) -> Points3D:
+    ids = sorted(model.reg_image_ids())
+    return np.array([model.image(i).projection_center() for i in ids], np.float64).reshape(-1, 3)
+
+
+def _is_place(model: pycolmap.Reconstruction, box: Box) -> bool:
+    """Whether most cameras stand in a box and look apart, and not at the middle of where they stand."""
+    centers = _centers(model)
+    looks = np.array([model.image(i).viewing_direction() for i in sorted(model.reg_image_ids())], np.float64)
+    offsets = (centers - box.center) @ np.linalg.pinv(box.half_edges)
+    toward = centers.mean(axis=0) - centers
+    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
+    stand_in = np.mean((np.abs(offsets) <= 1).all(axis=1))
+    look_inward = np.mean(np.sum(looks * toward, axis=1))
+    look_alike = np.linalg.norm(looks.mean(axis=0))
+    return bool(stand_in >= _MOST and look_alike < _MOST and look_inward < _MOST)
+
+
+def _place_box(box: Box, points: Points3D, centers: Float64[np.ndarray, "_ 3"]) -> Box:
+    axes = box.half_edges / np.linalg.norm(box.half_edges, axis=1, keepdims=True)
+    ends = [_TAIL, 1 - _TAIL]
+    low_high = np.stack([np.quantile(one @ axes.T, ends, axis=0) for one in (points, centers)])
+    low, high = low_high[:, 0].min(axis=0), low_high[:, 1].max(axis=0)
+    return Box((low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes)
 
 
 def _centrality(model: pycolmap.Reconstruction, ids: Ids) -> Float64[np.ndarray, " n"]:

@@ -26,6 +26,11 @@ _FEWEST = 3  # images of a model
 # When incremental mapping adjusts the whole model, and how often in a row: COLMAP's 1.1 and 5 give the same
 # models in a third more time.
 _GROWTH, _REFINEMENTS = 1.3, 2
+# Of triangulation: degrees and pixels by which an observation may be off.
+_LIMITS = (
+    *("create_max_angle_error", "continue_max_angle_error", "re_max_angle_error"),
+    *("merge_max_reproj_error", "complete_max_reproj_error"),
+)
 
 
 @contextmanager
@@ -188,8 +193,11 @@ def triangulate(
     *,
     seed: int,
     progress: ProgressBar = silent,
+    tolerance: float = 1.0,
 ) -> pycolmap.Reconstruction:
     """Triangulate the matches of a database from known poses and cameras, which stay as they are.
+
+    COLMAP's limits on errors are multiplied by `tolerance`.
 
     Raises:
         ReconstructionError: No point could be triangulated.
@@ -201,6 +209,9 @@ def triangulate(
     options.random_seed = options.triangulation.random_seed = seed
     pycolmap.set_random_seed(seed)
     options.extract_colors = False
+    for name in _LIMITS:
+        setattr(options.triangulation, name, tolerance * getattr(options.triangulation, name))
+    options.mapper.filter_max_reproj_error *= tolerance
     with single_step(progress, "triangulate points"):
         model = pycolmap.triangulate_points(model, database, workspace, workspace, options=options)
     if not model.num_points3D():

@@ -1,5 +1,6 @@
 """How much room a new map needs at least, told from its sources before the work."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from slimsfm.errors import InputError
@@ -12,11 +13,16 @@ _COPIES = 2  # features as they are extracted, and in the map or COLMAP's databa
 _IN_MODEL = 24  # bytes of a keypoint in images.bin
 
 
-def bytes_to_build(images: Path, options: BuildOptions) -> int:
-    """Bytes of the features of a folder of photos, in the files of a build that hold a copy of them.
+def bytes_to_build(sources: Sequence[Path], options: BuildOptions) -> int:
+    """Bytes of the features of folders of photos, in the files of a build that hold a copy of them.
 
-    A photo is taken to have no more bytes of features than its file has. 0 if there is no photo.
+    A photo is taken to have no more bytes of features than its file has. Videos count nothing. 0 if there is
+    no photo.
     """
+    return sum(_bytes_of_folder(source, options) for source in sources)
+
+
+def _bytes_of_folder(images: Path, options: BuildOptions) -> int:
     try:
         names = find_images(images, leave_out=options.masks).names
     except InputError:

@@ -16,6 +16,7 @@ from slimsfm.geometry import Box
 from slimsfm.lenses import camera_fault
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.choice import PickedModel
+from slimsfm.mapping.conventions import PoseConvention
 from slimsfm.mapping.extraction import CameraSharing
 from slimsfm.mapping.masked_photos import AlphaUse, MaskedPhotos
 from slimsfm.mapping.pairs import Matches, PairChoice
@@ -84,7 +85,7 @@ class BuildOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownPoses:
-    """Known cameras and poses of images; none of them is refined."""
+    """Known cameras and poses of images. Cameras are not refined, poses only if asked for."""
 
     cameras: Mapping[str, pycolmap.Camera]
     """Intrinsics by image name; images with equal `camera_id` share a camera."""
@@ -92,11 +93,23 @@ class KnownPoses:
     cam_from_world: Mapping[str, pycolmap.Rigid3d]
     """Poses by image name."""
 
-    box: Box
-    """The object's box in the world frame."""
+    box: Box | None = None
+    """The object's box in the world frame; None: estimated from the points."""
 
     unit: str
     """Unit of the world frame, such as "metre"."""
+
+    refine: bool = False
+    """Adjust the poses to the matches, in their frame and unit."""
+
+    convention: PoseConvention | None = None
+    """How the matrices of a file were read, which the matches are asked to confirm; None: beyond doubt."""
+
+    source: str = "the known poses"
+    """Where the poses come from, for messages."""
+
+    notes: tuple[str, ...] = ()
+    """Sentences on what was guessed, and on photos without a pose."""
 
     def __post_init__(self) -> None:
         for name, camera in self.cameras.items():
@@ -123,7 +136,7 @@ def build_key(
         "extractor": [extractor.name, repr(extractor.options)],
         "networks": _networks(options),
         "options": {name: value for name, value in chosen.items() if name not in later},
-        "known": known and [[name, _text(known, name)] for name in names],
+        "known": known and [[name, _text(known, name)] for name in names if name in known.cameras],
     }
 
 
@@ -200,6 +213,9 @@ class MapParts:
 
     picked: PickedModel | None = None
     """The model as it was picked, with its support and what to say about it; None with known poses."""
+
+    notes: tuple[str, ...] = ()
+    """What else to say about the model."""
 
     photos: Mapping[str, Image] = field(default_factory=dict)
     """Small photos by image name, for extractors without keypoints."""

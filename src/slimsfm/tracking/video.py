@@ -17,10 +17,10 @@ import numpy as np
 from slimsfm.arrays import Image
 from slimsfm.errors import ImageError, InputError, OutputError, VideoError
 from slimsfm.files import replacing
+from slimsfm.film import film_pictures, open_film, pyav
 from slimsfm.image_files import list_images
 from slimsfm.photos import Orientation, read_image
 from slimsfm.skipping import SkippedPhotos
-from slimsfm.tracking.film import film_pictures, open_film, pyav
 
 VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """Container formats of the videos that can be written, by suffix."""
