@@ -180,7 +180,7 @@ def _facts(found: Alignment) -> dict:
         "rotation_bound_95_deg": found.turn_bound_deg,
         "heading_bound_95_deg": found.heading_bound_deg,
         "new_from_old": {
-            "scale": moved.scale,
+            "scale": float(moved.scale),
             "quaternion_xyzw": moved.rotation.quat.tolist(),
             "translation": moved.translation.tolist(),
         },

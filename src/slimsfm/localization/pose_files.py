@@ -255,7 +255,7 @@ def _write_colmap(file: TextIO, rows: list[_Row]) -> None:
 
 
 _GEOPOSE = (
-    "geopose: OGC GeoPose 1.0, Basic-Quaternion; the quaternion turns vectors in the camera's frame (x right, "
+    "geopose: OGC GeoPose 1.0, Basic-Quaternion; its quaternion turns vectors of the camera frame (x right, "
     "y down, z forward) into east, north, up at its position"
 )
 

@@ -99,7 +99,7 @@ class Georeference:
             "longitude": self.longitude,
             "height": self.height,
             "enu_from_world": {
-                "scale": self.enu_from_world.scale,
+                "scale": float(self.enu_from_world.scale),
                 "quaternion_xyzw": self.enu_from_world.rotation.quat.tolist(),
                 "translation": self.enu_from_world.translation.tolist(),
             },
