@@ -33,8 +33,8 @@ def align_to_positions(map: Map, known: KnownPositions) -> Alignment:
         (positions[0], enu_of_wgs84(positions, positions[0])) if known.is_geographic else (None, positions)
     )
     axes = _EARTH_AXES if known.is_geographic else _OWN_AXES
-    check_not_stretched(centers, target, known.source, axes)
     found = fit_similarity(centers, target)
+    check_not_stretched(centers, target, known.source, axes)
     check_determined(found, centers, known.source)
     place, new_from_old = None, found.target_from_source
     if origin is not None:

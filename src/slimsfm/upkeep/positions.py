@@ -48,7 +48,7 @@ class KnownPositions:
 
 
 def _is_on_earth(position: Position) -> bool:
-    return abs(position[0]) <= 90 and abs(position[1]) <= 180
+    return bool(abs(position[0]) <= 90 and abs(position[1]) <= 180)
 
 
 def read_positions(path: str | Path) -> KnownPositions:

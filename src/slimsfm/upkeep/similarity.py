@@ -25,6 +25,7 @@ _MEDIAN = 1.538  # of the length of a normal vector in space, over the standard 
 _INLIER = 3.37  # 99 % of such lengths, over the same
 _ACCURACY = 1e-2  # of SfM, which drifts, over the extent of the positions
 _ROUNDS = 20
+_FLAT = 1e-6  # extent beside a line over that along it
 
 MAX_TURN_DEG = 10.0
 """Largest 95 % bound of a rotation that counts as determined."""
@@ -94,6 +95,11 @@ def fit_similarity(source: Points3D, target: Points3D, *, seed: int = 0) -> Simi
         raise InputError(f"a similarity needs at least 3 positions, but {len(source)} can be used")
     if not np.ptp(source, axis=0).any() or not np.ptp(target, axis=0).any():
         raise InputError(f"the {len(source)} positions are all in one place, which determines nothing")
+    if any(thickness(one)[1] <= _FLAT * thickness(one)[0] for one in (source, target)):
+        raise InputError(
+            f"the {len(source)} positions lie on a line, which does not determine how the map is turned "
+            "about it; add some beside it"
+        )
     samples = sampled(len(source), 3, seed)
     fits = [pycolmap.estimate_sim3d(source[rows], target[rows]) for rows in samples]
     found = least_median([fit for fit in fits if fit is not None], source, target)

@@ -22,13 +22,13 @@ class Stretch:
     """How positions are stretched against those that images give."""
 
     factor: float
-    """Length in one direction over length in another one, both over those that the images give."""
+    """Length in one direction over length in the others, both over those that the images give."""
 
     direction: Float64[np.ndarray, "3"]
-    """Unit vector of the longer one in the frame of the positions."""
+    """Unit vector of this direction in the frame of the positions."""
 
-    least_factor: float
-    """What the factor exceeds with a probability of 99.9 %."""
+    least_ratio: float
+    """What the ratio of longest to shortest exceeds with a probability of 99.9 %."""
 
     is_mirrored: bool
     """Whether the positions are a mirror image."""
@@ -44,7 +44,7 @@ def stretch_between(source: Points3D, target: Points3D, *, seed: int = 0) -> Str
     axes = [k for k in (2, 3) if k <= len(sizes) and sizes[k - 1] > _FLAT * sizes[0]]
     found = [_stretch(source, target, k, seed) for k in axes]
     known = [one for one in found if one is not None]
-    return max(known, key=lambda one: one.least_factor, default=None)
+    return max(known, key=lambda one: one.least_ratio, default=None)
 
 
 def check_not_stretched(source: Points3D, target: Points3D, what: str, axes: tuple[str, str, str]) -> None:
@@ -67,10 +67,11 @@ def check_not_stretched(source: Points3D, target: Points3D, what: str, axes: tup
             f"the {what} are a mirror image of what the images show: two coordinates are swapped, or one has "
             "the wrong sign"
         )
-    if found.least_factor > _LEAST_STRETCH:
+    if found.least_ratio > _LEAST_STRETCH:
         raise InputError(
-            f"the {what} contradict the images: {_named(found.direction, axes)}, they are stretched by a "
-            f"factor of {found.factor:.2f}, which no choice of scale explains; correct them"
+            f"the {what} contradict the images: {_named(found.direction, axes)}, they are "
+            f"{found.factor:.2f} times as long as they should be, which no choice of scale explains; correct "
+            "them"
         )
 
 
@@ -136,14 +137,16 @@ def _measured(
 ) -> Stretch:
     """The stretch of a linear map from principal axes."""
     left, values, right = np.linalg.svd(linear, full_matrices=False)
+    values = np.maximum(values, 1e-9 * max(values[0], 1e-300))
     variances = np.einsum("ij,jk,ik->i", right, covariance, right) / values**2
-    factor = values[0] / values[-1]
+    ratio = values[0] / values[-1]
+    odd = len(values) - 1 if values[1] ** 2 > values[0] * values[-1] else 0
     spread = np.sqrt(variances[0] + variances[-1])
     quantile = student.ppf(_CONFIDENCE, freedom)
     weakest = 1 / np.sqrt(variances[-1])
     return Stretch(
-        factor=float(factor),
-        direction=left[:, 0],
-        least_factor=float(factor * np.exp(-quantile * spread)),
-        is_mirrored=len(values) == 3 and np.linalg.det(linear @ vectors) < 0 and weakest > quantile,
+        factor=float(values[odd] / np.delete(values, odd).mean()),
+        direction=left[:, odd],
+        least_ratio=float(ratio * np.exp(-quantile * spread)),
+        is_mirrored=bool(len(values) == 3 and np.linalg.det(linear @ vectors) < 0 and weakest > quantile),
     )

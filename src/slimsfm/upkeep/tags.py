@@ -7,7 +7,6 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from jaxtyping import Float64
 
 from slimsfm.arrays import GrayImage
 from slimsfm.errors import InputError
@@ -15,6 +14,7 @@ from slimsfm.files import inside
 from slimsfm.mapping.map import Map
 from slimsfm.photos import read_photo
 from slimsfm.progress import ProgressBar, silent
+from slimsfm.upkeep.tag_corners import Corners, refine_corners
 
 Family = Literal[
     "apriltag-36h11",
@@ -40,8 +40,6 @@ _DICTIONARIES = {
 }
 _HALF_PIXEL = 0.5  # from OpenCV's pixels to COLMAP's
 _TRIED = 10  # photos in which other families are looked for
-
-Corners = Float64[np.ndarray, "4 2"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,8 +83,11 @@ def find_tags(
         )
     detector, found = _detector(family), dict[int, list[TagView]]()
     for name in progress(there, "look for tags"):
-        for number, corners in _tags_in(_photo(map, folder, name), detector).items():
-            found.setdefault(number, []).append(TagView(image=name, corners=corners))
+        photo = _photo(map, folder, name)
+        for number, rough in _tags_in(photo, detector).items():
+            corners = refine_corners(photo, rough, map.camera(name))
+            if corners is not None:
+                found.setdefault(number, []).append(TagView(image=name, corners=corners))
     if not found:
         others = _other_families(map, folder, there[:: max(1, len(there) // _TRIED)], family)
         hint = f"; there are tags of {others}" if others else "; take photos of it from nearer"
