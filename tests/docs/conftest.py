@@ -101,9 +101,18 @@ def projects(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = (filmed / "camera.txt").read_text().split()[1:]
     lines = [" ".join([path.name, *camera]) for path in sorted((filmed / "new").iterdir())]
     (folder / "queries.txt").write_text("\n".join(lines) + "\n")
+    (folder / "positions.csv").write_text(_positions(made))
     corners = [" ".join(f"{value:.6f}" for value in corner) for corner in made.box.corners]
     (folder / "box3d_corners.txt").write_text("\n".join(corners) + "\n")
     return folder
+
+
+def _positions(made: Map) -> str:
+    """The true positions of the images, as a table."""
+    path = mapping_take("printed_box", FILM, 320, 240, seed=0).cam_from_object
+    places = {name: path[int(Path(name).stem)].inverse().translation for name in made.images}
+    lines = [f"{name},{x},{y},{z}" for name, (x, y, z) in places.items()]
+    return "\n".join(["name,x,y,z", *lines]) + "\n"
 
 
 def _write_database(working: Path, made: Map, path: Path) -> None:
