@@ -47,9 +47,15 @@ if TYPE_CHECKING:
     )
     from slimsfm.report.tracked_video import track_video
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
+    from slimsfm.upkeep.add import Addition, AddOptions, add
+    from slimsfm.upkeep.forget import ForgetOptions, Forgetting, forget
 
 _MODULES = {
+    "AddOptions": "slimsfm.upkeep.add",
+    "Addition": "slimsfm.upkeep.add",
     "BuildOptions": "slimsfm.mapping",
+    "ForgetOptions": "slimsfm.upkeep.forget",
+    "Forgetting": "slimsfm.upkeep.forget",
     "FrontierOptions": "slimsfm.reduction",
     "Gravity": "slimsfm.pose",
     "ImageOptions": "slimsfm.reduction",
@@ -66,8 +72,10 @@ _MODULES = {
     "Tracked": "slimsfm.tracking",
     "Tracker": "slimsfm.tracking",
     "TrackerOptions": "slimsfm.tracking",
+    "add": "slimsfm.upkeep.add",
     "build_map": "slimsfm.mapping",
     "estimate_pose": "slimsfm.pose",
+    "forget": "slimsfm.upkeep.forget",
     "frontier": "slimsfm.reduction",
     "import_colmap": "slimsfm.mapping",
     "localize_images": "slimsfm.localization",
@@ -83,7 +91,11 @@ _MODULES = {
 """The module of each public name. A new name needs a line here, in `__all__` and in the imports above."""
 
 __all__ = [
+    "AddOptions",
+    "Addition",
     "BuildOptions",
+    "ForgetOptions",
+    "Forgetting",
     "FrontierOptions",
     "Gravity",
     "ImageOptions",
@@ -100,8 +112,10 @@ __all__ = [
     "Tracked",
     "Tracker",
     "TrackerOptions",
+    "add",
     "build_map",
     "estimate_pose",
+    "forget",
     "frontier",
     "import_colmap",
     "localize_images",

@@ -1,6 +1,6 @@
 """Extend a map by images whose poses are known, without moving anything that it has."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import count
@@ -12,12 +12,12 @@ from jaxtyping import UInt8
 from scipy.spatial import KDTree
 
 from slimsfm.errors import MapError
-from slimsfm.features import Features, shrink_factor
-from slimsfm.geometry import resized_camera
+from slimsfm.features import Features
 from slimsfm.mapping.descriptors import describe_new_images
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import Matches
 from slimsfm.upkeep.local_sfm import triangulate_and_adjust
+from slimsfm.upkeep.shrunk import shrunk_model, take_cameras
 
 Key = TypeVar("Key", str, tuple[str, str])
 Value = TypeVar("Value")
@@ -31,7 +31,7 @@ class NewImage:
     """Its local features, by the map's extractor."""
 
     camera: pycolmap.Camera
-    """Its intrinsics, which are not refined. A camera of the map with equal `camera_id` is shared; any other
+    """Its intrinsics. A camera of the map with equal `camera_id` is shared; any other
     id makes it another camera, under this id."""
 
     cam_from_world: pycolmap.Rigid3d
@@ -44,7 +44,14 @@ class NewImage:
     """RGB at each keypoint. Without it, new points get the color of the nearest old one."""
 
 
-def extend_map(map: Map, new: Mapping[str, NewImage], matches: Matches, *, seed: int = 0) -> Map:
+def extend_map(
+    map: Map,
+    new: Mapping[str, NewImage],
+    matches: Matches,
+    *,
+    refined_cameras: Collection[int] = (),
+    seed: int = 0,
+) -> Map:
     """Extend a map by images of known pose.
 
     Matched keypoints continue the tracks of points that they agree with; others are triangulated. Poses of
@@ -62,6 +69,7 @@ def extend_map(map: Map, new: Mapping[str, NewImage], matches: Matches, *, seed:
         new: The new images by name.
         matches: Verified matches by pair of names in order (a, b), a < b, with at least one new image each.
             Rows are those of the features. Those of the old images among each other are in the map.
+        refined_cameras: Ids of cameras that only new images have, whose intrinsics are refined too.
         seed: Seed of the triangulation.
 
     Returns:
@@ -73,13 +81,16 @@ def extend_map(map: Map, new: Mapping[str, NewImage], matches: Matches, *, seed:
             no new image.
     """
     _check(map, new, matches)
+    if taken := {image.camera_id for image in map.images.values()}.intersection(refined_cameras):
+        raise ValueError(f"refined_cameras must be of new images alone, but {min(taken)} is not")
     model = pycolmap.Reconstruction(map.model)
     _add_images(model, new)
-    work = _shrunk(map, model)
+    work = shrunk_model(model, map.info.extractor_options)
     near = {name for pair in matches for name in pair}
     old_matches = {pair: map.matches[pair] for pair in map.matches if near.issuperset(pair)}
-    triangulate_and_adjust(work, new, {**old_matches, **matches}, seed=seed)
+    triangulate_and_adjust(work, new, {**old_matches, **matches}, refined_cameras=refined_cameras, seed=seed)
     _take_over(map, model, work, new)
+    take_cameras(work, model, sorted(refined_cameras), map.info.extractor_options)
     _color(map, model, new)
     model.update_point_3d_errors()
     features: Mapping[str, Features] = JoinedMapping(map.features, {name: new[name].features for name in new})
@@ -140,25 +151,6 @@ def _rig_of(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> int:
     rig.add_ref_sensor(own.sensor_id)
     model.add_rig(rig)
     return rig.rig_id
-
-
-def _shrunk(map: Map, model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A copy of a model in the pixels in which features were found."""
-    work = pycolmap.Reconstruction(model)
-    factors = {
-        camera_id: shrink_factor(map.info.extractor_options, camera.width, camera.height)
-        for camera_id, camera in model.cameras.items()
-    }
-    for camera_id, factor in factors.items():
-        if factor != 1:
-            camera, smaller = work.camera(camera_id), resized_camera(work.camera(camera_id), 1 / factor)
-            camera.params = smaller.params.tolist()
-            camera.width, camera.height = smaller.width, smaller.height
-    for image in work.images.values():
-        if (factor := factors[image.camera_id]) != 1:
-            for point in image.points2D:
-                point.xy = point.xy / factor
-    return work
 
 
 def _take_over(

@@ -2,11 +2,11 @@
 
 COLMAP's triangulator continues tracks of points with keypoints that agree with them, and makes points of
 keypoints that see none. Poses of the new images and positions of the new points are adjusted together. Old
-images, old points and all cameras are constant. All is done in the pixels in which features were found, which
-COLMAP's limits are for.
+images, old points and their cameras are constant. All is done in the pixels in which features were found,
+which COLMAP's limits are for.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import pycolmap
 from threadpoolctl import threadpool_limits
@@ -18,7 +18,12 @@ _ROUNDS = 2  # after the first adjustment, more keypoints agree
 
 
 def triangulate_and_adjust(
-    model: pycolmap.Reconstruction, new: Iterable[str], matches: Matches, *, seed: int
+    model: pycolmap.Reconstruction,
+    new: Iterable[str],
+    matches: Matches,
+    *,
+    refined_cameras: Collection[int] = (),
+    seed: int,
 ) -> None:
     """Give new images of a model observations, and adjust their poses, in place.
 
@@ -26,6 +31,7 @@ def triangulate_and_adjust(
         model: The model, in pixels of the shrunk images. The new images have poses and keypoints.
         new: Names of the new images.
         matches: Verified matches by pair of names, of the new images and of others around them.
+        refined_cameras: Ids of the cameras whose intrinsics are adjusted too.
         seed: Seed of the triangulation.
     """
     ids = {model.image(i).name: i for i in sorted(model.reg_image_ids())}
@@ -42,7 +48,7 @@ def triangulate_and_adjust(
             for image_id in new_ids:
                 triangulator.triangulate_image(options, image_id)
             triangulator.complete_tracks(options, set(model.point3D_ids()) - old_points)
-            _adjust(model, new_ids, old_points)
+            _adjust(model, new_ids, old_points, refined_cameras)
             _filter(model, observations, new_ids, old_points)
 
 
@@ -61,11 +67,15 @@ def _correspondences(
     return graph
 
 
-def _adjust(model: pycolmap.Reconstruction, new_ids: list[int], old_points: set[int]) -> None:
+def _adjust(
+    model: pycolmap.Reconstruction,
+    new_ids: list[int],
+    old_points: set[int],
+    refined_cameras: Collection[int],
+) -> None:
     """Adjust the new images and points; what is not in the problem is constant."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.refine_sensor_from_rig = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1
@@ -73,6 +83,8 @@ def _adjust(model: pycolmap.Reconstruction, new_ids: list[int], old_points: set[
     for image_id in new_ids:
         if model.image(image_id).num_points3D:
             config.add_image(image_id)
+    for camera_id in sorted(set(model.cameras) - set(refined_cameras)):
+        config.set_constant_cam_intrinsics(camera_id)
     for point_id in sorted(set(model.point3D_ids()) - old_points):
         config.add_variable_point(point_id)
     for point_id in sorted(_seen(model, new_ids) & old_points):
