@@ -49,15 +49,21 @@ if TYPE_CHECKING:
     )
     from slimsfm.report.tracked_video import track_video
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
+    from slimsfm.upkeep.add import Addition, AddOptions, add
     from slimsfm.upkeep.align import Distance, Gps, GravityUp, OtherMap, Positions, Tag, align
     from slimsfm.upkeep.alignment import Alignment
+    from slimsfm.upkeep.forget import ForgetOptions, Forgetting, forget
     from slimsfm.upkeep.positions import read_positions
     from slimsfm.upkeep.transform import transformed
 
 _MODULES = {
+    "AddOptions": "slimsfm.upkeep.add",
+    "Addition": "slimsfm.upkeep.add",
     "Alignment": "slimsfm.upkeep.alignment",
     "BuildOptions": "slimsfm.mapping",
     "Distance": "slimsfm.upkeep.align",
+    "ForgetOptions": "slimsfm.upkeep.forget",
+    "Forgetting": "slimsfm.upkeep.forget",
     "FrontierOptions": "slimsfm.reduction",
     "Gps": "slimsfm.upkeep.align",
     "Gravity": "slimsfm.pose",
@@ -80,10 +86,12 @@ _MODULES = {
     "Tracked": "slimsfm.tracking",
     "Tracker": "slimsfm.tracking",
     "TrackerOptions": "slimsfm.tracking",
+    "add": "slimsfm.upkeep.add",
     "align": "slimsfm.upkeep.align",
     "build_map": "slimsfm.mapping",
     "estimate_pose": "slimsfm.pose",
     "extract_frames": "slimsfm.mapping",
+    "forget": "slimsfm.upkeep.forget",
     "frontier": "slimsfm.reduction",
     "import_colmap": "slimsfm.mapping",
     "localize_images": "slimsfm.localization",
@@ -101,9 +109,13 @@ _MODULES = {
 """The module of each public name. A new name needs a line here, in `__all__` and in the imports above."""
 
 __all__ = [
+    "AddOptions",
+    "Addition",
     "Alignment",
     "BuildOptions",
     "Distance",
+    "ForgetOptions",
+    "Forgetting",
     "FrontierOptions",
     "Gps",
     "Gravity",
@@ -126,10 +138,12 @@ __all__ = [
     "Tracked",
     "Tracker",
     "TrackerOptions",
+    "add",
     "align",
     "build_map",
     "estimate_pose",
     "extract_frames",
+    "forget",
     "frontier",
     "import_colmap",
     "localize_images",

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 from slimsfm.cli.arguments import Execution
@@ -16,9 +17,16 @@ from slimsfm.cli.tables import (
     read_reducible,
 )
 from slimsfm.errors import InputError
-from slimsfm.mapping.io import write_map
+from slimsfm.mapping.io import read_map, write_map
 from slimsfm.progress import shown
-from slimsfm.reduction import Conditions, ImageOptions, ReduceOptions, ReductionLimits
+from slimsfm.reduction import (
+    Conditions,
+    ImageOptions,
+    ReduceOptions,
+    ReductionLimits,
+    repeated_options,
+    with_parent,
+)
 from slimsfm.reduction import reduce as reduce_map
 from slimsfm.reduction.reduced import Use
 
@@ -158,6 +166,7 @@ def reduce(
     /,
     output: OutputPath,
     choosing: ReduceArguments = ReduceArguments(),
+    as_: Annotated[Path | None, Flags(("--as",))] = None,
     execution: Annotated[Execution, Advanced()] = Execution(),
     overwrite: bool = False,
 ) -> None:
@@ -171,14 +180,19 @@ def reduce(
         map: The full map.
         output: Where to write the reduced map.
         choosing: How to choose what is kept.
+        as_: A reduced map: choose as when it was made, from a smaller map, and by no other option.
         execution: Where the reference graph is computed.
         overwrite: Replace an existing output.
     """
     watch = Stopwatch()
     check_output(output, map, choosing.image_choice.graph, overwrite=overwrite)
+    if as_ is not None and choosing != ReduceArguments():
+        raise InputError("as repeats a reduction, so no option can say how to choose what is kept")
     full, options = read_reducible(map), choosing.options
+    if as_ is not None:
+        options = repeated_options(read_map(as_), as_, full)
     reduced = reduce_map(full, options, graph=kept_graph(map, execution), progress=shown)
-    write_map(reduced.map, output, overwrite=overwrite)
+    write_map(with_parent(reduced.map, full, map, output, options), output, overwrite=overwrite)
     for note in reduced.notes:
         console.print(f"note: {note}")
     print_dominating_set(reduced, options)

@@ -15,6 +15,20 @@ SMALLEST_FIRST_SIZE = 64
 """Least value of `MapInfo.first_image_size`: smaller images show hardly any features."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Parent:
+    """The map that a map was reduced from, and by which choice."""
+
+    path: str
+    """Its folder, relative to that of the reduced map, with forward slashes."""
+
+    fingerprint: str
+    """Its `Map.fingerprint`."""
+
+    options: dict[str, Any] = field(default_factory=dict)
+    """Options of the reduction that are not the default, as JSON values."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapInfo:
     """Metadata of a map, stored in its `map.json`.
@@ -64,6 +78,9 @@ class MapInfo:
     first_image_size: int | None = None
     """Longer side, in pixels, of the image that the first features of a query are extracted from; `reduce`
     finds it. None if it was not searched for."""
+
+    parent: Parent | None = None
+    """The map that this one was reduced from. None for full maps and for maps of older versions."""
 
     def __post_init__(self) -> None:
         for name in ("extractor", "box_source", "unit", "origin"):

@@ -15,7 +15,7 @@ from slimsfm.files import contents_of, plain, read_json
 from slimsfm.files.checksums import COPY_AGAIN, Checksum, checksum_of_json, checksums_of
 from slimsfm.geometry import Box
 from slimsfm.mapping.georeference import Georeference
-from slimsfm.mapping.info import MapInfo
+from slimsfm.mapping.info import MapInfo, Parent
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.quality import quality_from_json
 from slimsfm.photos import Orientation
@@ -73,6 +73,7 @@ def _info_to_json(map: Map) -> dict:
         **({"exif_orientations": tags} if tags else {}),
         **({"devices": devices} if devices else {}),
         **({"first_image_size": info.first_image_size} if info.first_image_size else {}),
+        **({"parent": asdict(info.parent)} if info.parent else {}),
         "quality": None if info.quality is None else asdict(info.quality),
     }
 
@@ -131,6 +132,7 @@ def _info_from_json(data: dict[str, Any]) -> MapInfo:
         orientation=plain(data.get("orientation", "upright"), Orientation),
         exif_orientations=plain(data.get("exif_orientations", {}), dict[str, int]),
         first_image_size=plain(data.get("first_image_size"), int | None),
+        parent=plain(data.get("parent"), Parent | None),
         devices={int(key): device for key, device in devices.items()},
     )
 

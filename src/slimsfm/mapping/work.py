@@ -126,23 +126,30 @@ def build_key(
     known: KnownPoses | None,
 ) -> dict[str, Any]:
     """All that features and matches depend on: photos and masks, options, known poses, and versions."""
-    files = [path for name in names for path in photos.files_of(name)]
     chosen = {field.name: getattr(options, field.name) for field in fields(options)}
     later = ("box", "model", "strict", "masks")  # masks count as files
     return {
         "versions": [version("slimsfm"), pycolmap.__version__, cv2.__version__],
         "images": [os.path.realpath(images), *names],
-        "files": [[str(path), *_stamp(path)] for path in files],
+        **files_key(photos, names, options.extractor, options.matcher),
         "extractor": [extractor.name, repr(extractor.options)],
-        "networks": _networks(options),
         "options": {name: value for name, value in chosen.items() if name not in later},
         "known": known and [[name, _text(known, name)] for name in names if name in known.cameras],
     }
 
 
-def _networks(options: BuildOptions) -> list:
+def files_key(photos: MaskedPhotos, names: list[str], extractor: str, matcher: str) -> dict[str, list]:
+    """The files that features and matches depend on: photos, masks and weights."""
+    files = [path for name in names for path in photos.files_of(name)]
+    return {
+        "files": [[str(path), *_stamp(path)] for path in files],
+        "networks": _networks(extractor, matcher),
+    }
+
+
+def _networks(extractor: str, matcher: str) -> list:
     """Device and weight files of learned methods; empty if none is used."""
-    if (options.extractor, options.matcher) == ("sift", "nearest"):
+    if (extractor, matcher) == ("sift", "nearest"):
         return []
     runtime = current_runtime()
     files = sorted(runtime.weights.iterdir()) if runtime.weights else []

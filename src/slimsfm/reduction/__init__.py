@@ -10,6 +10,7 @@ from slimsfm.reduction.choice import (
 )
 from slimsfm.reduction.disturbance import Conditions
 from slimsfm.reduction.forecast import Prediction, Trials
+from slimsfm.reduction.growth import Growth, predict_growth
 from slimsfm.reduction.image_sets import (
     DominatingSetOptions,
     dominating_set,
@@ -20,6 +21,7 @@ from slimsfm.reduction.image_sets import (
 from slimsfm.reduction.limits import ReductionLimits, recommend
 from slimsfm.reduction.pareto import USES, FrontierOptions, GraphProvider, forecast_images, frontier
 from slimsfm.reduction.reduced import ImageOptions, Reduced, ReduceOptions, reduce
+from slimsfm.reduction.repetition import repeated_options, with_parent
 from slimsfm.reduction.speed import Speed, measure_speed
 
 __all__ = [
@@ -32,6 +34,7 @@ __all__ = [
     "Frontier",
     "FrontierOptions",
     "GraphProvider",
+    "Growth",
     "ImageOptions",
     "Prediction",
     "ReduceOptions",
@@ -48,6 +51,9 @@ __all__ = [
     "keep_random_images",
     "measure_speed",
     "points_seen",
+    "predict_growth",
     "recommend",
     "reduce",
+    "repeated_options",
+    "with_parent",
 ]

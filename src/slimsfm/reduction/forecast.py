@@ -280,14 +280,26 @@ class Trials:
         descriptors, known = self._left_out.describe(points, name)
         return quantize(descriptors).restore(), known
 
-    def _nearest(self, name: str) -> list[Target]:
+    def among(self, tests: Collection[str], names: Collection[str], *, most: int) -> Prediction:
+        """Match some of the tests against the nearest of some references, without themselves.
+
+        Args:
+            tests: Some of `tests`.
+            names: The references.
+            most: How many of them a test is matched with: those with the most common points.
+        """
+        return self._predict(tests, lambda test: self._nearest(test, names, most))
+
+    def _nearest(
+        self, name: str, among: Collection[str] | None = None, most: int = _MOST_REFERENCES
+    ) -> list[Target]:
         names = list(self._map.images)
         row = names.index(name)
         others = slice(self._common.indptr[row], self._common.indptr[row + 1])
         images = self._common.indices[others]
         best = np.argsort(np.negative(self._common.data[others]), kind="stable")
-        nearest = [i for i in images[best] if i != row][:_MOST_REFERENCES]
-        return [self._reference(names[i]) for i in nearest]
+        allowed = [i for i in images[best] if i != row and (among is None or names[i] in among)]
+        return [self._reference(names[i]) for i in allowed[:most]]
 
     @lru_cache(maxsize=4 * _MOST_REFERENCES)  # noqa: B019, trials are few and short-lived
     def _reference(self, name: str) -> Target:
