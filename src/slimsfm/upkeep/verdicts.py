@@ -41,8 +41,8 @@ class Trial:
     @property
     def is_contradicted(self) -> bool:
         """Whether several sets of references agree that the pose is wrong, and more than confirm it."""
-        enough = len(self.contradicting) >= min(2, max(len(self.testimonies), 1))
-        return enough and 2 * len(self.contradicting) > len(self.testimonies)
+        against, heard = len(self.contradicting), len(self.testimonies)
+        return against >= min(2, max(heard, 1)) and 2 * against > heard
 
     @property
     def blame(self) -> float:
@@ -88,7 +88,7 @@ class Court:
                 advance_to(len(wrong))
                 self._retry(trials, worst, wrong)
         for _ in range(_ROUNDS):
-            back = {i for i in sorted(wrong) if self._is_confirmed(trials, i)}
+            back = {i for i in sorted(wrong) if not self._try_again(trials, i).is_contradicted}
             if not back:
                 break
             wrong -= back
@@ -101,11 +101,9 @@ class Court:
 
     def _retry(self, trials: dict[int, Trial], changed: set[int], wrong: set[int]) -> None:
         """Try those images again that have matches with images that were taken out or brought back."""
-        self._witnesses.suspect(())
-        touched = {other for i in changed for other in self._witnesses.references(i)} | changed
         self._witnesses.suspect(wrong)
-        for i in sorted(touched):
-            trials[i] = self._judge(self._hear(i))
+        for i in sorted({other for i in changed for other in self._witnesses.neighbors(i)} | changed):
+            self._try_again(trials, i)
 
     def _worst(self, trials: dict[int, Trial], wrong: set[int]) -> set[int]:
         """Contradicted images that are to blame more than each contradicted image that they have matches with."""
@@ -120,9 +118,12 @@ class Court:
             )
         }
 
-    def _is_confirmed(self, trials: dict[int, Trial], index: int) -> bool:
-        trial = trials[index] = self._judge(self._hear(index))
-        return bool(trial.testimonies) and not trial.contradicting
+    def _try_again(self, trials: dict[int, Trial], index: int) -> Trial:
+        """The new trial of an image; the former one, if what is left of the others does not localize it."""
+        trial = self._judge(self._hear(index))
+        if trial.testimonies or not trials[index].is_contradicted:
+            trials[index] = trial
+        return trials[index]
 
     def _hear(self, index: int) -> list[Testimony]:
         """Testimonies of disjoint sets of references, then the one of all together, if there are any."""

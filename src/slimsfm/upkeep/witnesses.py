@@ -110,9 +110,13 @@ class Witnesses:
             self._add(view, 1)
         self._places = _solved(self._normals, self._sides, self._counts)
 
+    def neighbors(self, index: int) -> list[int]:
+        """The images that have verified matches with an image, those with the most first."""
+        return [other for other, _ in self._pairs[index]]
+
     def references(self, index: int) -> list[int]:
-        """The images that have verified matches with an image, those with the most first, without suspects."""
-        return [other for other, _ in self._pairs[index] if other not in self._suspects]
+        """Its neighbors without suspects."""
+        return [other for other in self.neighbors(index) if other not in self._suspects]
 
     def suspect(self, indices: Iterable[int]) -> None:
         """Take out what some images contributed, instead of those that were taken out before."""
