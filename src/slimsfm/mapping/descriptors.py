@@ -203,6 +203,24 @@ def describe_images(map: Map, seed: int = 0) -> GlobalDescriptors:
     return GlobalDescriptors(vocabulary=words, descriptors=rows)
 
 
+def describe_new_images(map: Map, larger: Map) -> GlobalDescriptors | None:
+    """Global descriptors of a map that was extended: old ones stay, new images are described by its words.
+
+    Args:
+        map: The map before.
+        larger: The map with new images.
+
+    Returns:
+        One row per image of the larger map; None if the map has no global descriptors.
+    """
+    if map.global_descriptors is None:
+        return None
+    words = map.global_descriptors.vocabulary
+    old = dict(zip(map.images, map.global_descriptors.descriptors, strict=True))
+    rows = [old[name] if name in old else vlad(_seen(larger, name), words) for name in larger.images]
+    return GlobalDescriptors(vocabulary=words, descriptors=np.stack(rows))
+
+
 def _seen(map: Map, name: str) -> Descriptors:
     return unit_rows(map.features[name].descriptors[map.observations[name].rows])
 
