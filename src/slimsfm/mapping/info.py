@@ -61,6 +61,10 @@ class MapInfo:
     """Longer side, in pixels, of the image that the first features of a query are extracted from; `reduce`
     finds it. None if it was not searched for."""
 
+    wrong_poses: tuple[str, ...] = ()
+    """Images of the full map whose poses a check found wrong, by name: nothing is measured by them, and no
+    image must be kept to localize them."""
+
     def __post_init__(self) -> None:
         for name in ("extractor", "box_source", "unit", "origin"):
             plain(getattr(self, name), str)

@@ -1,1 +1,17 @@
 """Keep a map right and up to date: check its poses, align it to units and places, add, merge, forget."""
+
+from slimsfm.upkeep.checking import check
+from slimsfm.upkeep.findings import Blurred, Duplicate, MapCheck, Thread, Unlocalized, WrongPose
+from slimsfm.upkeep.repair import Repaired, repair
+
+__all__ = [
+    "Blurred",
+    "Duplicate",
+    "MapCheck",
+    "Repaired",
+    "Thread",
+    "Unlocalized",
+    "WrongPose",
+    "check",
+    "repair",
+]

@@ -1,4 +1,4 @@
-"""Check a map: which poses its own images contradict, which images nothing supports, and which add nothing."""
+"""Check a map: which poses its images contradict, which images nothing supports, and which add nothing."""
 
 from pathlib import Path
 
@@ -24,9 +24,9 @@ _MOST_EXHAUSTIVE = 60  # images up to which all pairs are matched, if the map ha
 def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar = silent) -> MapCheck:
     """Check a full map.
 
-    Each image is localized from disjoint sets of the others as if it were a query: by their verified matches, in
-    which no pose has a part, and by points that are triangulated without the image. Where several sets agree
-    that it stands elsewhere, its pose is wrong. Which poses are wrong is decided jointly: see
+    Each image is localized from disjoint sets of the others as if it were a query: by their verified matches,
+    in which no pose has a part, and by points that are triangulated without the image. Where several sets
+    agree that it stands elsewhere, its pose is wrong. Which poses are wrong is decided jointly: see
     `upkeep.verdicts`. The rest is cheap: see `upkeep.threads` and `upkeep.likeness`.
 
     Args:
@@ -86,7 +86,7 @@ def matches_of(map: Map, progress: ProgressBar = silent) -> Matches:
         return map.matches
     if not map.has_keypoints:
         raise MapError(
-            f"the map has no matches, and extractor {map.info.extractor!r} finds no keypoints to match again; "
+            f"the map has no matches, and extractor {map.info.extractor!r} no keypoints to match again; "
             "build it again, or import it with its matches"
         )
     names = list(map.images)

@@ -47,8 +47,9 @@ class WrongPose:
         """The finding in words."""
         sets = f"{len(self.sets)} disjoint sets of references" if len(self.sets) > 1 else "the references"
         return (
-            f"{self.name}: {sets} localize it {self.distance:.3f} d away, by {self.rotation_deg:.1f} degrees and "
-            f"{self.shift:.3g} units; {self.inliers} matches agree with them, {self.agreeing} with the map"
+            f"{self.name}: {sets} localize it {self.distance:.3f} d away, by {self.rotation_deg:.1f} degrees "
+            f"and {self.shift:.3g} units; {self.inliers} matches agree with them, of which {self.agreeing} "
+            "agree with the map"
         )
 
 
@@ -69,8 +70,8 @@ class Unlocalized:
     def sentence(self) -> str:
         """The finding in words."""
         return (
-            f"{self.name}: matched with {self.references} images, but only {self.matches} keypoints with points "
-            "that do not depend on it"
+            f"{self.name}: matched with {self.references} images, but only {self.matches} keypoints with "
+            "points that do not depend on it"
         )
 
 
@@ -98,8 +99,8 @@ class Duplicate:
         """The finding in words."""
         poses = "" if self.distance < _SAME else f"; yet their poses are {self.distance:.3f} d apart"
         return (
-            f"{self.copy}: as {self.name}; {self.matched:.0%} of the keypoints match, {self.moved_px:.1f} px apart"
-            f"{poses}"
+            f"{self.copy}: as {self.name}; {self.matched:.0%} of the keypoints match, "
+            f"{self.moved_px:.1f} px apart{poses}"
         )
 
 

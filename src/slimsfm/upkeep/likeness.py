@@ -1,4 +1,4 @@
-"""Images that add nothing: duplicates of others, and those that are less sharp than others that show the same."""
+"""Images that add nothing: duplicates, and those that are less sharp than others that show the same."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -38,14 +38,14 @@ def find_duplicates(map: Map, matches: Matches) -> tuple[Duplicate, ...]:
             continue
         moved = np.linalg.norm(one.keypoints[rows[:, 0]] - other.keypoints[rows[:, 1]], axis=1)
         if float(np.median(moved)) <= _SAME_PIXELS * max(map.camera(a).width, map.camera(a).height):
-            poses = (map.images[name].cam_from_world() for name in (a, b))
+            poses = [map.images[name].cam_from_world() for name in (a, b)]
             found.append(
                 Duplicate(
                     name=a,
                     copy=b,
                     matched=matched,
                     moved_px=float(np.median(moved)),
-                    distance=corner_error(*poses, map.box),
+                    distance=corner_error(poses[0], poses[1], map.box),
                 )
             )
     return tuple(found)
@@ -59,8 +59,8 @@ def find_blurred(
     Args:
         map: The map.
         neighbors: With whom each image is compared: the first ten. With fewer than three, it is not.
-        images: Folder of the photos. Without it, keypoints tell: blur leaves no small ones. Features without a
-            scale tell nothing.
+        images: Folder of the photos. Without it, keypoints tell: blur leaves no small ones. Features without
+            a scale tell nothing.
         progress: Progress callback.
 
     Raises:

@@ -1,8 +1,8 @@
 """Parts of a map that hang together by a thread, and what contradicts them.
 
 Images are joined by the matches that agree with the map. The strongest links that join all images are the
-maximum spanning tree. A link of the tree is a thread if it is much weaker than an image's best link usually is,
-and if both sides have several images: no other pair across has more matches.
+maximum spanning tree. A link of the tree is a thread if it is much weaker than an image's best link usually
+is, and if both sides have several images: no other pair across has more matches.
 """
 
 from collections.abc import Collection, Mapping

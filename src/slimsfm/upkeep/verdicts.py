@@ -1,12 +1,12 @@
 """Which poses of a map are wrong, decided jointly.
 
-An image is tried by up to three disjoint sets of the other images. A set contradicts the pose that the map has
-if the pose it gives is far off, compared with what is predicted and with how far off poses of this map usually
-are, and if fewer than half of its matches also agree with the pose of the map.
+An image is tried by up to three disjoint sets of the other images. A set contradicts the pose that the map
+has if the pose it gives is far off, compared with what is predicted and with how far off poses of this map
+usually are, and if fewer than half of its matches also agree with the pose of the map.
 
-Where one pose is wrong, right ones may be contradicted by it. So the worst images are taken out first, with all
-they contributed, and their neighbors are tried again. In the end each image that was taken out is tried by
-those that are left, and comes back if they confirm it.
+Where one pose is wrong, right ones may be contradicted by it. So the worst images are taken out first, with
+all they contributed, and their neighbors are tried again. In the end each image that was taken out is tried
+by those that are left, and comes back if they confirm it.
 """
 
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ class Verdicts:
 
 
 class Court:
-    """Tries the images of a map until no pose is contradicted by images that are not contradicted themselves."""
+    """Tries images until no pose is contradicted by images that are not contradicted themselves."""
 
     def __init__(self, witnesses: Witnesses, box: Box, progress: ProgressBar) -> None:
         self._witnesses = witnesses
@@ -102,11 +102,12 @@ class Court:
     def _retry(self, trials: dict[int, Trial], changed: set[int], wrong: set[int]) -> None:
         """Try those images again that have matches with images that were taken out or brought back."""
         self._witnesses.suspect(wrong)
-        for i in sorted({other for i in changed for other in self._witnesses.neighbors(i)} | changed):
+        near = {other for one in changed for other in self._witnesses.neighbors(one)}
+        for i in sorted(near | changed):
             self._try_again(trials, i)
 
     def _worst(self, trials: dict[int, Trial], wrong: set[int]) -> set[int]:
-        """Contradicted images that are to blame more than each contradicted image that they have matches with."""
+        """Contradicted images that are more to blame than all contradicted images they have matches with."""
         blame = {i: one.blame for i, one in trials.items() if i not in wrong and one.is_contradicted}
         return {
             i
@@ -126,26 +127,24 @@ class Court:
         return trials[index]
 
     def _hear(self, index: int) -> list[Testimony]:
-        """Testimonies of disjoint sets of references, then the one of all together, if there are any."""
+        """Testimonies of disjoint sets of references, if each gives one, then the one of all together."""
         references = self._witnesses.references(index)
+        together = self._witnesses.testimony(index, references) if references else None
+        if together is None:
+            return []
         for number in range(min(_SETS, len(references)), 1, -1):
             sets = [references[start::number] for start in range(number)]
             found = [one for one in (self._witnesses.testimony(index, some) for some in sets) if one]
-            if len(found) >= min(number, 2) and (len(found) == number or number == 2):  # noqa: PLR2004
-                break
-        else:
-            found = []
-        together = self._witnesses.testimony(index, references) if references else None
-        return [*found, together] if together else []
+            if len(found) == number:
+                return [*found, together]
+        return [together]
 
     def _judge(self, heard: Sequence[Testimony]) -> Trial:
         if not heard:
             return Trial(testimonies=(), together=None, contradicting=())
         sets, together = heard[:-1] or heard, heard[-1]
         against = [one for one in sets if self._contradicts(one)]
-        return Trial(
-            testimonies=tuple(sets), together=together, contradicting=tuple(self._agreeing(against))
-        )
+        return Trial(testimonies=tuple(sets), together=together, contradicting=tuple(self._agreeing(against)))
 
     def _contradicts(self, one: Testimony) -> bool:
         is_far = one.distance > _SIGMAS * self._usual * one.predicted_error
@@ -153,7 +152,7 @@ class Court:
 
     def _agreeing(self, found: list[Testimony]) -> list[Testimony]:
         """The testimonies that agree with another one; a single one agrees with itself."""
-        if len(found) < 2:  # noqa: PLR2004
+        if len(found) < 2:
             return found
         close = {
             i

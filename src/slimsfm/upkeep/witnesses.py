@@ -1,8 +1,8 @@
-"""Where the other images of a map say that an image stands, without anything that the image itself contributed.
+"""Where the other images of a map say that an image stands, without what the image itself contributed.
 
-An image and a reference are joined by verified matches, which no pose has a part in. Where the matched keypoint
-of the reference observes a point, the match is a 2D-3D match of the image. The position of the point must not
-depend on the image either: it is triangulated anew from the other observations.
+An image and a reference are joined by verified matches, which no pose has a part in. Where the matched
+keypoint of the reference observes a point, the match is a 2D-3D match of the image. The position of the point
+must not depend on the image either: it is triangulated anew from the other observations.
 """
 
 from collections import defaultdict
@@ -92,9 +92,9 @@ class Witnesses:
         matches: Verified matches by pair of names.
 
     Notes:
-        Triangulation is the least squares of distances to rays, each weighted by focal length over depth, that
-        is of angular errors. Its normal equations are sums over the observations, so that leaving an image out
-        is a subtraction.
+        Triangulation is the least squares of distances to rays, each weighted by focal length over depth,
+        that is of angular errors. Its normal equations are sums over the observations, so that leaving an
+        image out is a subtraction.
     """
 
     def __init__(self, map: Map, matches: Matches) -> None:
@@ -242,7 +242,7 @@ def _solved(
 
 
 def _pairs_by_image(names: Sequence[str], matches: Matches) -> list[list[tuple[int, IndexPairs]]]:
-    """For each image the others it has matches with, and (own keypoint, other keypoint), most matches first."""
+    """For each image the others and (own keypoint, other keypoint), those with the most matches first."""
     index = {name: i for i, name in enumerate(names)}
     found: dict[int, list[tuple[int, IndexPairs]]] = defaultdict(list)
     for a, b in sorted(matches):
