@@ -46,9 +46,8 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
     matches = matches_of(map, progress)
     witnesses = Witnesses(map, matches)
     verdicts = Court(witnesses, map.box, progress).decide()
-    names = witnesses.names
+    names, wrong = witnesses.names, _wrong_of(map, verdicts)
     neighbors = {name: [names[j] for j in witnesses.neighbors(i)] for i, name in enumerate(names)}
-    wrong = tuple(_wrong(map, names[i], verdicts.trials[i]) for i in verdicts.wrong)
     agreeing = agreement(map.images, matches)
     return MapCheck(
         images=len(names),
@@ -61,6 +60,12 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
         blurred=find_blurred(map, neighbors, None if images is None else Path(images), progress),
         threads=find_threads(names, matches, agreeing, {one.name for one in wrong}),
     )
+
+
+def wrong_poses(map: Map, progress: ProgressBar = silent) -> tuple[WrongPose, ...]:
+    """The images of a full map whose poses the others contradict: what benchmarks need of `check`."""
+    witnesses = Witnesses(map, matches_of(map, progress))
+    return _wrong_of(map, Court(witnesses, map.box, progress).decide())
 
 
 def check_is_full(map: Map) -> None:
@@ -102,6 +107,11 @@ def matches_of(map: Map, progress: ProgressBar = silent) -> Matches:
     geometries = verify_matches(features, cameras, found, seed=0, progress=progress)
     verified = {pair: np.asarray(one.inlier_matches, np.int64) for pair, one in geometries.items()}
     return {pair: rows.reshape(-1, 2) for pair, rows in verified.items() if len(rows)}
+
+
+def _wrong_of(map: Map, verdicts: Verdicts) -> tuple[WrongPose, ...]:
+    names = list(map.images)
+    return tuple(_wrong(map, names[i], verdicts.trials[i]) for i in verdicts.wrong)
 
 
 def _wrong(map: Map, name: str, trial: Trial) -> WrongPose:

@@ -38,9 +38,14 @@ class Trial:
     contradicting: tuple[Testimony, ...]
     """Those that contradict the pose of the map and agree with each other."""
 
+    together_contradicts: bool = False
+    """Whether all together contradict it."""
+
     @property
     def is_contradicted(self) -> bool:
-        """Whether several sets of references agree that the pose is wrong, and more than confirm it."""
+        """Whether several sets of references, more than confirm it, and all together say it is wrong."""
+        if not self.together_contradicts:
+            return False
         against, heard = len(self.contradicting), len(self.testimonies)
         return against >= min(2, max(heard, 1)) and 2 * against > heard
 
@@ -144,7 +149,12 @@ class Court:
             return Trial(testimonies=(), together=None, contradicting=())
         sets, together = heard[:-1] or heard, heard[-1]
         against = [one for one in sets if self._contradicts(one)]
-        return Trial(testimonies=tuple(sets), together=together, contradicting=tuple(self._agreeing(against)))
+        return Trial(
+            testimonies=tuple(sets),
+            together=together,
+            contradicting=tuple(self._agreeing(against)),
+            together_contradicts=self._contradicts(together),
+        )
 
     def _contradicts(self, one: Testimony) -> bool:
         is_far = one.distance > _SIGMAS * self._usual * one.predicted_error
