@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from slimsfm.arrays import Ids, IndexPairs, Mask, Points2D, Points3D
 from slimsfm.geometry import corner_error, reprojection_errors, resized_camera
@@ -27,6 +27,10 @@ _MAX_ERROR_PX = 4.0  # of an observation that counts; COLMAP drops others
 _MIN_ANGLE = np.radians(1.0)  # between the rays of a point
 _MOST_MATCHES = 800  # per pose: more of them hardly change it
 _NEED = 2  # observations of a point
+_SCATTER = (
+    4.0  # times the median error of the inliers: how far off a match may be that agrees with another pose
+)
+_LEAST_PX = 1.5  # of that
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +47,7 @@ class Testimony:
     """Number of matches that agree with it."""
 
     agreeing: int
-    """Number of these matches that also agree with the pose that the map has."""
+    """Number of these matches that also agree with the pose that the map has, as closely as they scatter."""
 
     distance: float
     """Relative corner error between both poses."""
@@ -69,7 +73,7 @@ class _View:
     sides: Float64[np.ndarray, "m 3"]
     """Right side that each of its observations adds."""
 
-    seen: Ids
+    seen: Int64[np.ndarray, " m"]
     """Row of the point of each observation."""
 
 
@@ -137,14 +141,18 @@ class Witnesses:
         pose = estimate_pose(pixels, points3D, view.camera)
         if pose is None or pose.num_inliers < MIN_INLIERS:
             return None
-        limit_px = RansacOptions().max_error_px
-        errors = reprojection_errors(pixels, points3D, view.cam_from_world, view.camera)
+        found_px, stored_px = (
+            reprojection_errors(pixels, points3D, one, view.camera)
+            for one in (pose.cam_from_world, view.cam_from_world)
+        )
+        scatter_px = float(np.median(found_px[pose.inliers]))
+        limit_px = np.clip(_SCATTER * scatter_px, _LEAST_PX, RansacOptions().max_error_px)
         rows = matched.keypoints[::step]
         return Testimony(
             references=tuple(self.names[i] for i in references),
             cam_from_world=pose.cam_from_world,
             inliers=_num_keypoints(rows, pose),
-            agreeing=len(np.unique(rows[pose.inliers & (errors <= limit_px)])),
+            agreeing=len(np.unique(rows[pose.inliers & (stored_px <= limit_px)])),
             distance=corner_error(pose.cam_from_world, view.cam_from_world, self._box),
             predicted_error=pose.predicted_corner_error(self._box),
         )
