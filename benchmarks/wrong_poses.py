@@ -40,12 +40,15 @@ def poses_of(map: Map) -> dict[str, pycolmap.Rigid3d]:
 
 
 def made_wrong(map: Map, count: int, *, retriangulate: bool, seed: int) -> WrongMap:
-    """Make poses wrong: of each three, one is moved, one has another image's pose, one stands at its twin position.
+    """Make poses wrong.
+
+    Of each three images, one is moved, one has the pose of another, and one stands at its twin position.
 
     Args:
-        map: A right map with matches. count: How many. retriangulate: Triangulate all matches with the wrong
-        poses, as from wrong annotations. Otherwise points
-            and tracks stay as they are.
+        map: A right map with matches.
+        count: How many.
+        retriangulate: Triangulate all matches with the wrong poses, as from wrong annotations. Otherwise
+            points and tracks stay as they are.
         seed: Seed of the choice.
     """
     rng, right = np.random.default_rng(seed), poses_of(map)

@@ -51,7 +51,7 @@ def check(
     """
     watch = Stopwatch()
     if repair and output is None:
-        raise InputError("`repair=True` makes a map: give `output`, its folder")
+        raise InputError("--repair makes a map: give its folder with --output")
     _check_outputs(map, output, figure, overwrite=overwrite)
     map_ = read_map(map)
     found = check_map(map_, images=images, progress=shown)

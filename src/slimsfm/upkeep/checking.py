@@ -88,7 +88,7 @@ def matches_of(map: Map, progress: ProgressBar = silent) -> Matches:
         MapError: It stores none, and its features have no keypoints that could be matched one by one.
     """
     if map.matches:
-        return map.matches
+        return dict(map.matches)  # read once
     if not map.has_keypoints:
         raise MapError(
             f"the map has no matches, and extractor {map.info.extractor!r} no keypoints to match again; "

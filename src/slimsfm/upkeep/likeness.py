@@ -32,11 +32,12 @@ def find_duplicates(map: Map, matches: Matches) -> tuple[Duplicate, ...]:
     """Find pairs of images most of whose keypoints match at the same pixels."""
     found = []
     for a, b in sorted(pair for pair in matches if map.images.keys() >= set(pair)):
-        rows, (one, other) = matches[a, b], (map.features[a], map.features[b])
-        matched = len(rows) / max(min(len(one), len(other)), 1)
+        rows = matches[a, b]
+        matched = len(rows) / max(min(map.images[name].num_points2D() for name in (a, b)), 1)
         if matched < _SAME_KEYPOINTS:
             continue
-        moved = np.linalg.norm(one.keypoints[rows[:, 0]] - other.keypoints[rows[:, 1]], axis=1)
+        one, other = (map.features[name].keypoints for name in (a, b))
+        moved = np.linalg.norm(one[rows[:, 0]] - other[rows[:, 1]], axis=1)
         if float(np.median(moved)) <= _SAME_PIXELS * max(map.camera(a).width, map.camera(a).height):
             poses = [map.images[name].cam_from_world() for name in (a, b)]
             found.append(

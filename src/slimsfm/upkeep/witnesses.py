@@ -26,6 +26,7 @@ MIN_INLIERS = 15
 _MAX_ERROR_PX = 4.0  # of an observation that counts; COLMAP drops others
 _MIN_ANGLE = np.radians(1.0)  # between the rays of a point
 _MOST_MATCHES = 800  # per pose: more of them hardly change it
+_MOST_REFERENCES = 24  # of an image
 _NEED = 2  # observations of a point
 _SCATTER = (
     4.0  # times the median error of the inliers: how far off a match may be that agrees with another pose
@@ -119,8 +120,8 @@ class Witnesses:
         return [other for other, _ in self._pairs[index]]
 
     def references(self, index: int) -> list[int]:
-        """Its neighbors without suspects."""
-        return [other for other in self.neighbors(index) if other not in self._suspects]
+        """The first 24 of its neighbors that are no suspects."""
+        return [other for other in self.neighbors(index) if other not in self._suspects][:_MOST_REFERENCES]
 
     def suspect(self, indices: Iterable[int]) -> None:
         """Take out what some images contributed, instead of those that were taken out before."""
@@ -166,12 +167,14 @@ class Witnesses:
                 found = self._views[other].points[rows[:, 1]]
                 keypoints.append(rows[found >= 0, 0])
                 points.append(found[found >= 0])
-        pairs = np.unique(np.stack([np.concatenate(keypoints), np.concatenate(points)], axis=1), axis=0)
-        places = self._places[pairs[:, 1]]
-        own = np.isin(pairs[:, 1], view.seen) & (index not in self._suspects)
-        places[own] = self._without(view, pairs[own, 1])
+        count = max(len(self._places), 1)
+        pairs = np.unique(np.concatenate(keypoints) * count + np.concatenate(points))
+        pair_keypoints, pair_points = np.divmod(pairs, count)
+        places = self._places[pair_points]
+        own = np.isin(pair_points, view.seen) & (index not in self._suspects)
+        places[own] = self._without(view, pair_points[own])
         known = np.isfinite(places).all(axis=1)
-        return Matched(keypoints=pairs[known, 0], points3D=places[known])
+        return Matched(keypoints=pair_keypoints[known], points3D=places[known])
 
     def _add(self, view: _View, sign: int) -> None:
         np.add.at(self._normals, view.seen, sign * view.normals)
