@@ -23,11 +23,8 @@ from slimsfm.mapping import Map
 from slimsfm.upkeep import check, repair
 from wrong_poses import made_wrong
 
-SHARES = (0.0, 0.05, 0.1)
-"""Of the images whose poses are made wrong; the first means a single image."""
 
-
-def rows(scene: Scene, seeds: int) -> Iterator[list]:
+def rows(scene: Scene, shares: list[float], seeds: int) -> Iterator[list]:
     """The lines of the table for a scene."""
     right, total = scene.references, len(scene.references.images)
     clean = check(right)
@@ -43,7 +40,7 @@ def rows(scene: Scene, seeds: int) -> Iterator[list]:
         "-",
     ]
     for retriangulate in (True, False):
-        for share in SHARES:
+        for share in shares:
             found = blamed = wrong = moved = dropped = 0
             seconds, before, after = [], "-", "-"
             for seed in range(seeds):
@@ -56,11 +53,11 @@ def rows(scene: Scene, seeds: int) -> Iterator[list]:
                 blamed += len(names - made.wrong)
                 repaired = repair(made.map, one)
                 moved, dropped = moved + len(repaired.moved), dropped + len(repaired.dropped)
-                if share == SHARES[-1] and seed == 0:
+                if share == shares[-1] and seed == 0:
                     before, after = within(scene, made.map), within(scene, repaired.map)
             how = "triangulated again" if retriangulate else "points stay"
             alarms = f"{blamed} of {seeds * total - wrong}"
-            outcome = f"{moved} / {dropped}"
+            outcome = f"{moved}, {dropped}"
             yield [
                 scene.name,
                 how,
@@ -88,15 +85,14 @@ def main() -> None:
     parser.add_argument("--posed", type=Path, nargs="*", default=[], help="folders with a transforms.json")
     parser.add_argument("--objects", nargs="*", default=[], help="names of rendered objects")
     parser.add_argument("--seeds", type=int, default=2, help="choices of wrong images (default: 2)")
+    parser.add_argument("--shares", type=float, nargs="+", default=[0, 0.05, 0.1], help="wrong; 0: one image")
     wanted = parser.parse_args()
-    print(
-        "| scene | points | wrong | found | right ones blamed | set right / dropped | CPU s | queries | after |"
-    )
+    print("| scene | points | wrong | found | right, blamed | set right, dropped | CPU s | queries | after |")
     print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
     made = (posed(folder, wanted.output) for folder in wanted.posed)
     for some in (scenes(wanted.photos, wanted.objects, wanted.output), made):
         for scene in some:
-            for row in rows(scene, wanted.seeds):
+            for row in rows(scene, wanted.shares, wanted.seeds):
                 print("| " + " | ".join(map(str, row)) + " |", flush=True)
 
 

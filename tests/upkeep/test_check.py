@@ -9,6 +9,7 @@ from slimsfm.geometry import corner_error
 from slimsfm.graph import ReferenceGraph
 from slimsfm.mapping import read_map, write_map
 from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.support import measure
 from slimsfm.reduction import DominatingSetOptions, dominating_set
 from slimsfm.upkeep import check, repair
 from slimsfm.upkeep.likeness import find_duplicates
@@ -24,6 +25,7 @@ def test_a_right_map_has_no_findings(right):
     found = check(right)
     nothing = found.wrong, found.unlocalized, found.duplicates, found.blurred, found.threads
     assert nothing == ((), (), (), (), ())
+    assert not found.is_contradicted
     assert found.usual_error < 1e-6
     assert (found.images, found.matches_from) == (12, "map")
 
@@ -89,6 +91,26 @@ def test_two_images_of_equal_pixels_are_duplicates(right):
     (one,) = find_duplicates(replace(right, features=features), {(a, b): pairs})
     assert (one.name, one.copy, one.matched, one.moved_px) == (a, b, 1.0, 0.0)
     assert "poses are" in one.sentence  # although the pixels are equal
+
+
+def test_a_pair_of_neighbors_that_contradicts_the_map_is_a_fold(right):
+    pair = "004.png", "005.png"
+    rows = right.matches[pair].copy()
+    rows[:, 1] = np.roll(rows[:, 1], 1)
+    folded = replace(right, matches={**right.matches, pair: rows})
+    found = check(folded)
+    assert not found.wrong
+    assert found.is_contradicted
+    (one,) = found.contradicted_pairs
+    assert ((one.first, one.second), one.matches) == (pair, len(rows))
+    assert one.agreeing < 0.3
+    given = replace(
+        right.info,
+        quality=replace(
+            measure(right.model, right.matches, right.images), focal_origins={"001.png": "given"}
+        ),
+    )
+    assert not check(replace(folded, info=given)).contradicted_pairs  # known poses are believed more
 
 
 def test_an_image_without_small_keypoints_is_blurred(right):

@@ -21,7 +21,7 @@ from slimsfm.upkeep import repair as repair_map
 EXIT_FOUND = 1
 """Exit code if poses are wrong, as linters have it for what they find."""
 
-_STYLES = {"wrong poses": "bold red", "threads": "bold red"}
+_STYLES = {"wrong poses": "bold red", "contradicted pairs": "bold red", "threads": "bold red"}
 
 
 def check(
@@ -37,7 +37,7 @@ def check(
     """Find images whose poses are wrong, and parts and images that little supports.
 
     Each image is localized from the others, by points that do not depend on it. The exit code is 1 if the
-    others contradict poses and `--repair` did not set them right or drop them, 0 if not.
+    others contradict poses, and with `--repair` if something else contradicts the map; 0 if nothing does.
 
     Args:
         map: A full map.
@@ -67,7 +67,8 @@ def check(
         print(json_format.dumps(_facts(found, repaired), indent=2))
     else:
         _print(found, repaired, output, watch)
-    return EXIT_FOUND if found.wrong and not repair else 0
+    left = found.contradicted_pairs if repair else found.is_contradicted
+    return EXIT_FOUND if left else 0
 
 
 def _check_outputs(map: Path, output: Path | None, figure: Path | None, *, overwrite: bool) -> None:
@@ -107,6 +108,7 @@ def _print(found: MapCheck, repaired: Repaired | None, output: Path | None, watc
 def _sections(found: MapCheck) -> dict[str, Sequence[Any]]:
     return {
         "wrong poses": found.wrong,
+        "contradicted pairs": found.contradicted_pairs,
         "not localized by any others": found.unlocalized,
         "threads": found.threads,
         "duplicates": found.duplicates,
@@ -121,6 +123,7 @@ def _facts(found: MapCheck, repaired: Repaired | None) -> dict[str, Any]:
         "matches_from": found.matches_from,
         "usual_error": found.usual_error,
         "wrong": [_wrong(one) for one in found.wrong],
+        "contradicted_pairs": [asdict(one) for one in found.contradicted_pairs],
         "unlocalized": [asdict(one) for one in found.unlocalized],
         "threads": [asdict(one) for one in found.threads],
         "duplicates": [asdict(one) for one in found.duplicates],

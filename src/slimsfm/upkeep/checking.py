@@ -1,5 +1,6 @@
 """Check a map: which poses its images contradict, which images nothing supports, and which add nothing."""
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,9 @@ from slimsfm.geometry import rotation_error_deg
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.matching import verify_matches
 from slimsfm.mapping.pairs import Matches, choose_pairs, exhaustive_pairs
-from slimsfm.mapping.support import agreement
+from slimsfm.mapping.support import MIN_AGREEING, Pair, agreement, trusted_pairs
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.upkeep.findings import MapCheck, Unlocalized, WrongPose
+from slimsfm.upkeep.findings import ContradictedPair, MapCheck, Unlocalized, WrongPose
 from slimsfm.upkeep.likeness import find_blurred, find_duplicates
 from slimsfm.upkeep.threads import find_threads
 from slimsfm.upkeep.verdicts import Court, Trial, Verdicts
@@ -55,6 +56,7 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
         matches_from="map" if map.matches else "matched again",
         usual_error=_usual_error(verdicts),
         wrong=wrong,
+        contradicted_pairs=_contradicted_pairs(map, matches, agreeing, {one.name for one in wrong}),
         unlocalized=_unlocalized(witnesses, verdicts),
         duplicates=find_duplicates(map, matches),
         blurred=find_blurred(map, neighbors, None if images is None else Path(images), progress),
@@ -130,6 +132,20 @@ def _wrong(map: Map, name: str, trial: Trial) -> WrongPose:
         rotation_deg=rotation_error_deg(others.cam_from_world, stored),
         shift=float(np.linalg.norm(centers[0] - centers[1])),
         predicted_error=others.predicted_error,
+    )
+
+
+def _contradicted_pairs(
+    map: Map, matches: Matches, agreeing: Mapping[Pair, float], wrong: Collection[str]
+) -> tuple[ContradictedPair, ...]:
+    quality = map.info.quality
+    if quality is not None and "given" in quality.focal_origins.values():
+        return ()
+    left = {pair: matches[pair] for pair in agreeing if not set(pair) & set(wrong)}
+    return tuple(
+        ContradictedPair(first=a, second=b, matches=len(left[a, b]), agreeing=agreeing[a, b])
+        for a, b in sorted(trusted_pairs(left, [name for name in map.images if name not in wrong]))
+        if agreeing[a, b] < MIN_AGREEING
     )
 
 

@@ -160,6 +160,30 @@ class Thread:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class ContradictedPair:
+    """Two images whose matches are hard to doubt, and contradict the map: it may be folded there."""
+
+    first: str
+    """Name of one image."""
+
+    second: str
+    """Name of the other one."""
+
+    matches: int
+    """Number of their verified matches."""
+
+    agreeing: float
+    """Share of the matches that agree with the poses of the map."""
+
+    @property
+    def sentence(self) -> str:
+        """The finding in words."""
+        return (
+            f"{self.first}, {self.second}: {self.agreeing:.0%} of {self.matches} matches agree with the map"
+        )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapCheck:
     """What a check of a map found."""
@@ -179,6 +203,10 @@ class MapCheck:
     wrong: tuple[WrongPose, ...]
     """Images whose poses are wrong, by name."""
 
+    contradicted_pairs: tuple[ContradictedPair, ...]
+    """Other pairs of images that are hard to doubt (`mapping.support`) and contradict the map. Not looked for
+    where poses were given, which are believed more than look-alike matches."""
+
     unlocalized: tuple[Unlocalized, ...]
     """Images that no others localize, by name."""
 
@@ -190,6 +218,11 @@ class MapCheck:
 
     threads: tuple[Thread, ...]
     """Parts that little holds together."""
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether anything contradicts poses of the map."""
+        return bool(self.wrong or self.contradicted_pairs)
 
     @property
     def wrong_names(self) -> tuple[str, ...]:
