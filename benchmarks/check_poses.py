@@ -5,7 +5,7 @@
 Makes poses of right maps wrong: one image, 5 % and 10 %; a third each are moved, have another image's pose,
 or stand at the twin position of a symmetric object. Points are triangulated again with the wrong poses, or
 stay as they were. Prints what is found, and the share of held-out queries within 0.1 of the diagonal on the
-right, the wrong and the repaired map. With `--room`, maps a rendered room with a patterned carpet by plain
+right, the wrong and the repaired map. With `--rooms`, maps rendered rooms with patterned carpet by plain
 pycolmap, and prints which images are really wrong and which are found.
 """
 
@@ -17,6 +17,7 @@ from time import process_time
 import numpy as np
 
 from benchmark_scenes import Scene, scenes
+from plain_rooms import ROOMS, plain_room
 from posed_scenes import posed
 from slimsfm.evaluation.results import evaluate
 from slimsfm.mapping import Map
@@ -77,6 +78,18 @@ def within(scene: Scene, map: Map) -> str:
     return f"{100 * np.mean(outcomes.error < 0.1):.1f}"
 
 
+def print_room(name: str, output: Path) -> None:
+    """Print what is really wrong in a room, and what is found."""
+    room = plain_room(name, output)
+    found = check(room.map)
+    names = set(found.wrong_names)
+    blamed = sorted(names - room.wrong)
+    print(f"{name}: {len(room.map.images)} images, really wrong: {', '.join(sorted(room.wrong)) or 'none'}")
+    print(f"found {len(names & room.wrong)} of {len(room.wrong)}, blamed: {', '.join(blamed) or 'none'}")
+    for one in (*found.wrong, *found.contradicted_pairs, *found.unlocalized, *found.threads):
+        print(f"  {type(one).__name__}: {one.sentence}")
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -86,7 +99,12 @@ def main() -> None:
     parser.add_argument("--objects", nargs="*", default=[], help="names of rendered objects")
     parser.add_argument("--seeds", type=int, default=2, help="choices of wrong images (default: 2)")
     parser.add_argument("--shares", type=float, nargs="+", default=[0, 0.05, 0.1], help="wrong; 0: one image")
+    parser.add_argument(
+        "--rooms", nargs="*", default=[], choices=list(ROOMS), help="mapped by plain pycolmap"
+    )
     wanted = parser.parse_args()
+    for name in wanted.rooms:
+        print_room(name, wanted.output)
     print("| scene | points | wrong | found | right, blamed | set right, dropped | CPU s | queries | after |")
     print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
     made = (posed(folder, wanted.output) for folder in wanted.posed)
