@@ -1,6 +1,7 @@
 """How many wrong poses `check` finds, how many right ones it blames, and what `repair` makes of the map.
 
     python benchmarks/check_poses.py -o /tmp/check --photos DIR ... --posed DIR --objects boulder printed_box
+    python benchmarks/check_poses.py -o /tmp/check --maps MAP ...
 
 Makes poses of right maps wrong: one image, 5 % and 10 %; a third each are moved, have another image's pose,
 or stand at the twin position of a symmetric object. Points are triangulated again with the wrong poses, or
@@ -20,7 +21,7 @@ from benchmark_scenes import Scene, scenes
 from plain_rooms import ROOMS, plain_room
 from posed_scenes import posed
 from slimsfm.evaluation.results import evaluate
-from slimsfm.mapping import Map
+from slimsfm.mapping import Map, read_map
 from slimsfm.upkeep import check, repair
 from wrong_poses import made_wrong
 
@@ -74,6 +75,8 @@ def rows(scene: Scene, shares: list[float], seeds: int) -> Iterator[list]:
 
 def within(scene: Scene, map: Map) -> str:
     """Percentage of the queries within 0.1 of the diagonal."""
+    if not scene.queries:
+        return "-"
     outcomes = evaluate(map, scene.queries, "progressive")
     return f"{100 * np.mean(outcomes.error < 0.1):.1f}"
 
@@ -97,6 +100,7 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, nargs="*", default=[], help="folders of photos")
     parser.add_argument("--posed", type=Path, nargs="*", default=[], help="folders with a transforms.json")
     parser.add_argument("--objects", nargs="*", default=[], help="names of rendered objects")
+    parser.add_argument("--maps", type=Path, nargs="*", default=[], help="full maps, without queries")
     parser.add_argument("--seeds", type=int, default=2, help="choices of wrong images (default: 2)")
     parser.add_argument("--shares", type=float, nargs="+", default=[0, 0.05, 0.1], help="wrong; 0: one image")
     parser.add_argument(
@@ -108,7 +112,8 @@ def main() -> None:
     print("| scene | points | wrong | found | right, blamed | set right, dropped | CPU s | queries | after |")
     print("|---|---|---:|---:|---:|---:|---:|---:|---:|")
     made = (posed(folder, wanted.output) for folder in wanted.posed)
-    for some in (scenes(wanted.photos, wanted.objects, wanted.output), made):
+    maps = (Scene(name=path.name, references=read_map(path), bytes=0, queries=[]) for path in wanted.maps)
+    for some in (maps, scenes(wanted.photos, wanted.objects, wanted.output), made):
         for scene in some:
             for row in rows(scene, wanted.shares, wanted.seeds):
                 print("| " + " | ".join(map(str, row)) + " |", flush=True)

@@ -57,7 +57,10 @@ def test_output_without_repair_is_the_map_with_marks(maps, tmp_path):
     same = "features.h5", "matches.h5", "sparse/points3D.bin", "sparse/images.bin"
     written, given = contents(tmp_path / "marked"), contents(maps / "wrong")
     assert [written[name] for name in same] == [given[name] for name in same]
-    assert "2 images marked by `check` as standing elsewhere" in slimsfm("info", tmp_path / "marked").out
+    assert (
+        "`check` found the poses of 2 images ('001.png', '006.png') wrong"
+        in slimsfm("info", tmp_path / "marked").out
+    )
 
 
 @pytest.mark.parametrize("suffix", [".svg", ".png"])

@@ -17,8 +17,8 @@ from slimsfm.cli.parsing import printable, with_flags
 from slimsfm.errors import OutputError
 from slimsfm.files import check_writable
 from slimsfm.files.space import check_place
+from slimsfm.mapping.agreement import counted
 from slimsfm.mapping.map import Map
-from slimsfm.upkeep.findings import listed
 
 _WIDTH = 170  # of the widest table; a narrower terminal wraps lines, but no number is cut off
 
@@ -129,8 +129,7 @@ def print_notes(map: Map) -> None:
 def print_warnings(map: Map) -> None:
     """Print why a map is in doubt."""
     if wrong := [name for name in map.info.wrong_poses if name in map.images]:
-        what = f"{plural(len(wrong), 'image')} marked by `check` as standing elsewhere"
-        console.print(f"warning: {what}: {listed(tuple(wrong))}", style="bold red")
+        console.print(f"warning: `check` found the poses of {counted(wrong)} wrong", style="bold red")
     for warning in map.info.quality.warnings if map.info.quality else ():
         console.print(f"warning: {warning}", style="bold red")
 
