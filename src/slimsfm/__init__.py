@@ -52,8 +52,11 @@ if TYPE_CHECKING:
     from slimsfm.upkeep.add import Addition, AddOptions, add
     from slimsfm.upkeep.align import Distance, Gps, GravityUp, OtherMap, Positions, Tag, align
     from slimsfm.upkeep.alignment import Alignment
+    from slimsfm.upkeep.checking import check
+    from slimsfm.upkeep.findings import MapCheck
     from slimsfm.upkeep.forget import ForgetOptions, Forgetting, forget
     from slimsfm.upkeep.positions import read_positions
+    from slimsfm.upkeep.repair import Repaired, repair
     from slimsfm.upkeep.transform import transformed
 
 _MODULES = {
@@ -75,6 +78,7 @@ _MODULES = {
     "LocalizationOptions": "slimsfm.localization",
     "Localizer": "slimsfm.localization",
     "Map": "slimsfm.mapping",
+    "MapCheck": "slimsfm.upkeep.findings",
     "MultiLocalizer": "slimsfm.localization",
     "OtherMap": "slimsfm.upkeep.align",
     "PoseEstimate": "slimsfm.pose",
@@ -82,6 +86,7 @@ _MODULES = {
     "RansacOptions": "slimsfm.pose",
     "ReduceOptions": "slimsfm.reduction",
     "ReductionLimits": "slimsfm.reduction",
+    "Repaired": "slimsfm.upkeep.repair",
     "Tag": "slimsfm.upkeep.align",
     "Tracked": "slimsfm.tracking",
     "Tracker": "slimsfm.tracking",
@@ -89,6 +94,7 @@ _MODULES = {
     "add": "slimsfm.upkeep.add",
     "align": "slimsfm.upkeep.align",
     "build_map": "slimsfm.mapping",
+    "check": "slimsfm.upkeep.checking",
     "estimate_pose": "slimsfm.pose",
     "extract_frames": "slimsfm.mapping",
     "forget": "slimsfm.upkeep.forget",
@@ -101,6 +107,7 @@ _MODULES = {
     "read_positions": "slimsfm.upkeep.positions",
     "reduce": "slimsfm.reduction",
     "refine_pose": "slimsfm.pose",
+    "repair": "slimsfm.upkeep.repair",
     "track_video": "slimsfm.report.tracked_video",
     "transformed": "slimsfm.upkeep.transform",
     "write_map": "slimsfm.mapping",
@@ -127,6 +134,7 @@ __all__ = [
     "LocalizationOptions",
     "Localizer",
     "Map",
+    "MapCheck",
     "MultiLocalizer",
     "OtherMap",
     "PoseEstimate",
@@ -134,6 +142,7 @@ __all__ = [
     "RansacOptions",
     "ReduceOptions",
     "ReductionLimits",
+    "Repaired",
     "Tag",
     "Tracked",
     "Tracker",
@@ -141,6 +150,7 @@ __all__ = [
     "add",
     "align",
     "build_map",
+    "check",
     "estimate_pose",
     "extract_frames",
     "forget",
@@ -153,6 +163,7 @@ __all__ = [
     "read_positions",
     "reduce",
     "refine_pose",
+    "repair",
     "track_video",
     "transformed",
     "write_map",

@@ -60,6 +60,7 @@ COMMANDS = {
     "info": Entry("info_command:info", "show what a map contains"),
     "view": Entry("view_command:view", "show a map in the browser and localize images in it"),
     "frontier": Entry("frontier_command:frontier_of", "compare the ways to reduce a map"),
+    "check": Entry("check_command:check", "find wrong poses and weak parts of a map, and repair them"),
     "graph": Entry("graph_command:graph", "compute which reference images localize which others"),
     "benchmark onepose": _benchmark("OnePose", "objects in OnePose's layout"),
     "benchmark onepose-lowtexture": _benchmark("OnePoseLowTexture", "objects in OnePose-LowTexture's layout"),
@@ -134,7 +135,7 @@ def run(arguments: Sequence[str]) -> int:
     from slimsfm.errors import SlimsfmError
 
     try:
-        _run_command(arguments)
+        return _run_command(arguments)
     except SlimsfmError as error:
         from slimsfm.cli.parsing import printable, with_flags
 
@@ -152,31 +153,31 @@ def run(arguments: Sequence[str]) -> int:
         outcome = str(interruption) or "no incomplete output was left behind"
         print(f"slimsfm: interrupted; {outcome}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    return 0
 
 
-def _run_command(arguments: Sequence[str]) -> None:
+def _run_command(arguments: Sequence[str]) -> int:
     first, rest = arguments[0], list(arguments[1:])
     subcommands = [name for name in COMMANDS if name.startswith(f"{first} ")]
     if not subcommands:
         _check_name(first, [name.split()[0] for name in COMMANDS], "a command")
-        _execute(first, rest)
-    elif not rest or rest[0] in ("-h", "--help"):
+        return _execute(first, rest)
+    if not rest or rest[0] in ("-h", "--help"):
         print(f"usage: slimsfm {first} {subcommands[0].split()[1]} ... [OPTIONS]\n\n{GROUPS[first]}:")
         print(_listed({name: COMMANDS[name].summary for name in subcommands}))
         print(f"\n`slimsfm {subcommands[0]} --help` explains one of them.")
-    else:
-        _check_name(rest[0], [name.split()[1] for name in subcommands], f"a subcommand of {first}")
-        _execute(f"{first} {rest[0]}", rest[1:])
+        return 0
+    _check_name(rest[0], [name.split()[1] for name in subcommands], f"a subcommand of {first}")
+    return _execute(f"{first} {rest[0]}", rest[1:])
 
 
-def _execute(name: str, arguments: Sequence[str]) -> None:
+def _execute(name: str, arguments: Sequence[str]) -> int:
+    """Run a command; its exit code is 0, unless it returns another one."""
     from slimsfm.cli.parsing import help_of, parse
 
     command = COMMANDS[name].load()
     if _asks_for_help(arguments):
         print(help_of(command, name))
-        return
+        return 0
     call = parse(command, name, arguments)
     _take_signal_back()
     from slimsfm.cli.output import quiet, tidy_warnings
@@ -185,7 +186,7 @@ def _execute(name: str, arguments: Sequence[str]) -> None:
     remove_abandoned()
     tidy_warnings()
     with quiet():
-        call()
+        return call() or 0
 
 
 def _check_name(name: str, known: Sequence[str], kind: str) -> None:

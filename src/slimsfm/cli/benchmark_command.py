@@ -68,7 +68,10 @@ def benchmark(
     objects = plural(len(run.objects), "object")
     queries = plural(sum(len(one.queries) for one in run.objects), "query", "queries")
     skipped = sum(len(one.skipped) for one in run.objects)
-    left_out = f" ({skipped} skipped)" if skipped else ""
+    contradicted = sum(len(one.contradicted) for one in run.objects)
+    reasons = [f"{skipped} skipped"] * bool(skipped)
+    reasons += [f"{plural(contradicted, 'image')} with contradicted poses left out"] * bool(contradicted)
+    left_out = f" ({', '.join(reasons)})" if reasons else ""
     what = f"{output}: {objects}, {queries}{left_out}, digest {digest_of(run.objects)}"
     finish(what, watch, "report", output, "-o", "report.html")
 

@@ -53,6 +53,7 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         },
         "origin": info.origin,
         "notes": list(info.notes),
+        "wrong_poses": [name for name in info.wrong_poses if name in map.images],
         "orientation": info.orientation,
         "exif_orientations": {
             name: tag for name, tag in info.exif_orientations.items() if name in map.images

@@ -58,8 +58,8 @@ ModelPath = Annotated[Path, Argument("MODEL")]
 class Command:
     """A function that the command line calls."""
 
-    function: Callable[..., None]
-    """Its signature is the command line."""
+    function: Callable[..., int | None]
+    """Its signature is the command line; it may return an exit code."""
 
     types: Mapping[str, type] = field(default_factory=dict)
     """Dataclasses that stand in for the declared types of parameters."""
@@ -201,7 +201,7 @@ def _metavar(kind: Any) -> str:
     return {bool: "", int: "N", float: "X", str: "NAME", Path: "PATH"}[kind]
 
 
-def _texts_of_arguments(function: Callable[..., None]) -> dict[str, str]:
+def _texts_of_arguments(function: Callable[..., int | None]) -> dict[str, str]:
     """What the section `Args:` of a docstring says of each parameter, each in one line."""
     section = (getdoc(function) or "").partition("\nArgs:\n")[2].partition("\n\n")[0]
     found: dict[str, str] = {}

@@ -17,6 +17,7 @@ from slimsfm.cli.parsing import printable, with_flags
 from slimsfm.errors import OutputError
 from slimsfm.files import check_writable
 from slimsfm.files.space import check_place
+from slimsfm.mapping.agreement import counted
 from slimsfm.mapping.georeference import Georeference
 from slimsfm.mapping.map import Map
 
@@ -136,6 +137,8 @@ def print_notes(map: Map) -> None:
 
 def print_warnings(map: Map) -> None:
     """Print why a map is in doubt."""
+    if wrong := [name for name in map.info.wrong_poses if name in map.images]:
+        console.print(f"warning: `check` found the poses of {counted(wrong)} wrong", style="bold red")
     for warning in map.info.quality.warnings if map.info.quality else ():
         console.print(f"warning: {warning}", style="bold red")
 

@@ -19,7 +19,7 @@ _WIDEST = 100  # of a line of help: longer ones are hard to read
 _INDENT = 24
 
 
-def parse(command: Command, name: str, arguments: Sequence[str]) -> Callable[[], None]:
+def parse(command: Command, name: str, arguments: Sequence[str]) -> Callable[[], int | None]:
     """Bind a command to what was typed.
 
     Args:

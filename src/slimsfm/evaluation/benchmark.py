@@ -17,6 +17,7 @@ from slimsfm.evaluation.results import (
     queries_of,
     readable_queries,
 )
+from slimsfm.evaluation.right_poses import with_marks, with_right_poses
 from slimsfm.evaluation.variants import Variant, VariantInputs, parse_variant
 from slimsfm.features.registry import EXTRACTORS, MATCHERS, plugins
 from slimsfm.files import working_folder
@@ -146,11 +147,14 @@ def benchmark_object(sequences: ObjectSequences, setup: BenchmarkSetup) -> Objec
 
     Impossible combinations are left out: a map that supports only direct matching has no measurement for
     other strategies, and a map without keypoints has none for direct matching. Queries that cannot be read
-    are skipped with a warning.
+    are skipped with a warning, and so are images whose true poses the others contradict.
 
     Raises:
         ImageError: No query can be read.
+        InputError: Too few images have true poses that are not contradicted.
     """
+    right = with_right_poses(sequences, setup.progress)
+    sequences = right.sequences
     queries = [replace(query, path=query.path.resolve()) for query in queries_of(sequences.query)]
     queries, skipped = readable_queries(queries, sequences.query.folder)
     maps, measurements = [], []
@@ -170,6 +174,7 @@ def benchmark_object(sequences: ObjectSequences, setup: BenchmarkSetup) -> Objec
         maps=tuple(maps),
         measurements=tuple(measurements),
         skipped=skipped,
+        contradicted=right.contradicted,
     )
 
 
@@ -217,7 +222,8 @@ def _full_map(task: _MethodTask) -> Map:
     if not path.exists():
         with working_folder() as workspace:
             options = setup.build_options(task.method)
-            write_map(map_object(task.sequences, workspace, options, setup.progress), path)
+            made = map_object(task.sequences, workspace, options, setup.progress)
+            write_map(with_marks(made, setup.progress), path)
     return read_map(path)
 
 

@@ -195,7 +195,13 @@ def _markdown_maps(results: Sequence[ObjectResult]) -> str:
         for mapped in result.maps
     ]
     warnings = [f"- **warning**: {name}, {method}: {why}\n" for name, method, why in map_warnings(results)]
-    return "".join([*support, *warnings])
+    left_out = [
+        f"- {result.name}: {len(result.contradicted)} images left out, whose true poses others contradict: "
+        f"{'; '.join(result.contradicted.values())}\n"
+        for result in results
+        if result.contradicted
+    ]
+    return "".join([*support, *left_out, *warnings])
 
 
 def markdown_page(run: Run, rows: Sequence[Row], comparisons: Sequence[Comparison]) -> str:

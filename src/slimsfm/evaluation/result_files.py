@@ -58,6 +58,7 @@ def object_to_json(result: ObjectResult) -> dict:
             for one in result.measurements
         ],
         **({"skipped_queries": dict(result.skipped)} if result.skipped else {}),
+        **({"contradicted_images": dict(result.contradicted)} if result.contradicted else {}),
     }
 
 
@@ -108,7 +109,7 @@ def digest_of(objects: Sequence[ObjectResult]) -> str:
 
 def _comparable(value: Any) -> Any:
     if isinstance(value, dict):
-        ignored = ("seconds", "images", "path", "quality", "notes", "skipped_queries")
+        ignored = ("seconds", "images", "path", "quality", "notes", "skipped_queries", "contradicted_images")
         return {key: _comparable(one) for key, one in value.items() if key not in ignored}
     return [_comparable(one) for one in value] if isinstance(value, list) else value
 

@@ -38,6 +38,7 @@ def object_from_json(data: dict) -> ObjectResult:
         maps=tuple(_mapped_from_json(one) for one in data["maps"]),
         measurements=tuple(_measurement_from_json(one) for one in data["cells"]),
         skipped=plain(data.get("skipped_queries", {}), dict[str, str]),
+        contradicted=plain(data.get("contradicted_images", {}), dict[str, str]),
     )
     _check(found)
     return found

@@ -198,6 +198,9 @@ class ObjectResult:
     skipped: Mapping[str, str] = field(default_factory=dict)
     """Why queries were not measured, by path: they cannot be read."""
 
+    contradicted: Mapping[str, str] = field(default_factory=dict)
+    """What contradicts the true pose of each query or mapping image that was left out, by name."""
+
     def measurement(self, method: str, strategy: str, variant: str) -> Measurement | None:
         """The measurement with this key, or None if it does not exist."""
         return next((one for one in self.measurements if one.key == (method, strategy, variant)), None)

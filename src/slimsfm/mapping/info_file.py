@@ -57,6 +57,7 @@ def _info_to_json(map: Map) -> dict:
     used = {image.camera_id for image in map.images.values()}
     devices = {str(key): asdict(device) for key, device in sorted(info.devices.items()) if key in used}
     tags = {name: info.exif_orientations[name] for name in map.images if name in info.exif_orientations}
+    wrong = [name for name in info.wrong_poses if name in map.images]
     return {
         "format_version": _format_version(map),
         "extractor": {"name": info.extractor, "options": info.extractor_options},
@@ -74,6 +75,7 @@ def _info_to_json(map: Map) -> dict:
         **({"devices": devices} if devices else {}),
         **({"first_image_size": info.first_image_size} if info.first_image_size else {}),
         **({"parent": asdict(info.parent)} if info.parent else {}),
+        **({"wrong_poses": wrong} if wrong else {}),
         "quality": None if info.quality is None else asdict(info.quality),
     }
 
@@ -133,6 +135,7 @@ def _info_from_json(data: dict[str, Any]) -> MapInfo:
         exif_orientations=plain(data.get("exif_orientations", {}), dict[str, int]),
         first_image_size=plain(data.get("first_image_size"), int | None),
         parent=plain(data.get("parent"), Parent | None),
+        wrong_poses=plain(data.get("wrong_poses", ()), tuple[str, ...]),
         devices={int(key): device for key, device in devices.items()},
     )
 

@@ -136,7 +136,7 @@ class Trials:
         self._disturbances = ROUGH if conditions == "rough" else ()
         self._extract_seconds = extract_seconds
         self._clock = clock
-        names = list(map.images)
+        names = [name for name in map.images if name not in map.info.wrong_poses]
         most = _MOST_TESTS if map.has_keypoints else 0  # a query has no descriptors
         self.tests = tuple(names[place] for place in evenly_spaced(len(names), most))
         sees = observed(map).astype(np.int32)

@@ -202,7 +202,8 @@ def dominating_set(graph: ReferenceGraph, options: DominatingSetOptions, map: Ma
     Args:
         graph: The reference graph.
         options: How to choose. A limit on the images that is large enough has no effect.
-        map: The map of the graph; only `rim` and costs other than "image" need it.
+        map: The map of the graph; only `rim` and costs other than "image" need it. Images whose poses it
+            marks as wrong localize no others, and no image is kept to localize them.
 
     Returns:
         The images. Optimality refers to their number or cost; to their errors only with `best`.
@@ -210,6 +211,7 @@ def dominating_set(graph: ReferenceGraph, options: DominatingSetOptions, map: Ma
     Raises:
         ValueError: The options need the map, or the graph belongs to another map.
     """
+    graph = _without_wrong(graph, map)
     problem = _problem(graph, options, map)
     found = SOLVERS[options.solver](problem, seed=options.seed)
     if options.max_images is not None and len(found.chosen) > options.max_images:
@@ -236,6 +238,7 @@ def image_order(
     Raises:
         ValueError: The options need the map, or the graph belongs to another map.
     """
+    graph = _without_wrong(graph, map)
     first = dominating_set(graph, options, map).chosen
     order = cover_order(_problem(graph, options, map), first=first)
     return tuple(graph.names[i] for i in order)
@@ -262,6 +265,18 @@ def images_within(order: tuple[str, ...], fits: Callable[[tuple[str, ...]], bool
         else:
             too_many = middle
     return order[:fitting]
+
+
+def _without_wrong(graph: ReferenceGraph, map: Map | None) -> ReferenceGraph:
+    """A graph in which images of wrong pose localize none, and nothing must be kept to localize them."""
+    wrong = np.isin(graph.names, map.info.wrong_poses if map else ())
+    if not wrong.any() or wrong.all():
+        return graph
+    errors = graph.dense()
+    errors[wrong] = np.inf
+    errors[np.ix_(~wrong, wrong)] = 0.0
+    pairs = np.argwhere(~np.eye(len(wrong), dtype=bool))
+    return ReferenceGraph.from_errors(graph.names, pairs, errors[pairs[:, 0], pairs[:, 1]])
 
 
 def _problem(

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from html import escape
 
 from slimsfm.evaluation.formats import map_warnings
-from slimsfm.evaluation.results import MappedObject, Run
+from slimsfm.evaluation.results import MappedObject, ObjectResult, Run
 from slimsfm.mapping.quality import ModelQuality
 
 
@@ -31,6 +31,16 @@ def support_html(mapped: MappedObject) -> str:
     items = "".join(f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
     notes = "".join(f"<dd>{escape(note)}</dd>" for note in mapped.notes)
     return f'<dl class="support">{items}{"<dt>Notes</dt>" * bool(notes)}{notes}</dl>'
+
+
+def left_out_html(result: ObjectResult) -> str:
+    """The images that were left out because their true poses are contradicted; empty if there are none."""
+    if not result.contradicted:
+        return ""
+    items = "".join(f"<li>{escape(why)}</li>" for why in result.contradicted.values())
+    count = len(result.contradicted)
+    title = f"{count} image{'s' * (count != 1)} left out: the others contradict the true poses"
+    return f"<details><summary>{title}</summary><ul>{items}</ul></details>"
 
 
 def _facts(quality: ModelQuality) -> dict[str, str]:

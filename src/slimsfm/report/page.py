@@ -20,7 +20,7 @@ from slimsfm.report.formatting import (
     rows_html,
 )
 from slimsfm.report.graph_view import GraphDrawing, graph_html
-from slimsfm.report.map_support import support_html
+from slimsfm.report.map_support import left_out_html, support_html
 from slimsfm.report.overview import charts_html, overview_html
 from slimsfm.report.report_data import (
     ReportBudget,
@@ -123,7 +123,7 @@ def _section(maps: RunMaps, data: ReportData, anchor: str, *, is_open: bool) -> 
 <p>{method}{escape(format_dominating_set(maps.mapped))}</p>
 {_view(maps, budget)}
 <h3>Support of the full map</h3>
-{support_html(maps.mapped)}
+{support_html(maps.mapped)}{left_out_html(result)}
 <h3>Reference graph</h3>
 {graph_html(drawing, result.images, budget.photo_px)}
 <h3>Accuracy and speed</h3>
