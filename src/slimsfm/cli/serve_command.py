@@ -40,7 +40,7 @@ def serve(
         cert: Certificate for HTTPS (PEM). By default a small authority makes one, which phones trust once.
         key: Private key of the certificate (PEM).
         record: Folder for images that clients send, with their poses; by default none is kept.
-        film: Folder of images that the page offers instead of a camera.
+        film: Video that the page offers instead of a camera.
         origins: Foreign pages that may send requests, such as https://example.org.
         workers: Number of threads that localize, by default the number of cores.
         localization: How to localize.
@@ -58,6 +58,8 @@ def serve(
         ) from error
     networks.apply()
     reading.apply()
+    if film and not film.is_file():
+        raise InputError(f"{film}: no such video")
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1, got {workers}")
     options = ServeOptions(

@@ -5,12 +5,14 @@ from collections.abc import Callable
 from time import perf_counter
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 
 from slimsfm.serve.bodies import read_body
 from slimsfm.serve.errors import ApiError, bad_request
+from slimsfm.serve.geopose import geopose_response, is_georeferenced, parse_geopose_request
 from slimsfm.serve.localizing import localize_bytes
-from slimsfm.serve.queries import query_of
+from slimsfm.serve.openapi import OPENAPI
+from slimsfm.serve.queries import LocalizeQuery, query_of
 from slimsfm.serve.replies import Json, map_reply, points_reply
 from slimsfm.serve.service import Service
 
@@ -52,6 +54,22 @@ async def localize(request: Request) -> Response:
     return JSONResponse({**reply, "ms": ms, "request_id": request_id})
 
 
+async def localize_geopose(request: Request) -> Response:
+    """`POST /oscp/localize/geopose`: the same by the protocol of the Open AR Cloud."""
+    service = service_of(request)
+    service.rate.take(client_of(request))
+    asked = parse_geopose_request(await read_body(request, service.options.limits))
+    maps = [one for one in service.store.select(()) if is_georeferenced(one.localizer.map)]
+    if not maps:
+        raise ApiError(404, "not_georeferenced", "no map says where on the earth it is")
+
+    def work() -> Json:
+        return localize_bytes(maps, LocalizeQuery(camera=asked.camera), asked.image)
+
+    reply = await run_unless_aborted(request, "localize", work)
+    return JSONResponse(geopose_response(asked, reply))
+
+
 async def run_unless_aborted(request: Request, kind: str, work: Callable[[], Json]) -> Json:
     """Run work on a worker; if the client leaves while it waits, it is not begun.
 
@@ -88,6 +106,27 @@ async def show_points(request: Request) -> Response:
     """`GET /v1/maps/{id}/points`."""
     served = service_of(request).store[request.path_params["id"]]
     return JSONResponse(await asyncio.to_thread(points_reply, served))
+
+
+async def show_film(request: Request) -> Response:
+    """`GET /v1/film`: a video that the page can play instead of a camera, also in parts."""
+    film = service_of(request).options.film
+    if film is None:
+        raise ApiError(404, "no_film", "the server has no film")
+    return FileResponse(film)
+
+
+async def show_authority(request: Request) -> Response:
+    """`GET /authority.crt`: the certificate that phones have to trust once."""
+    path = service_of(request).options.authority
+    if path is None:
+        raise ApiError(404, "no_authority", "the server has no authority of its own")
+    return FileResponse(path, media_type="application/x-x509-ca-cert", filename="slimsfm-authority.crt")
+
+
+async def show_api(request: Request) -> Response:  # noqa: ARG001
+    """`GET /openapi.json`."""
+    return JSONResponse(OPENAPI)
 
 
 async def healthz(request: Request) -> Response:

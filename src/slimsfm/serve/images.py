@@ -47,7 +47,7 @@ def image_file(data: bytes) -> Iterator[Path]:
     if format_of(data) == "JPEG" and data.count(_START_OF_SCAN) > _MOST_SCANS:
         raise ApiError(422, "bad_image", f"the JPEG has more than {_MOST_SCANS} scans")
     with _file_in_memory(data) as path, _answering(path):
-        with reading(path), opened_image(path) as file:
+        with reading(path), opened_image(path, any_size=True) as file:
             if file.format not in _PILLOW_NAMES:
                 raise ApiError(415, "not_an_image", "the body must be a JPEG, PNG or WebP file as it is")
             _check_size(*file.size)

@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from threading import Lock
 
 _BUCKETS_S = 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0
@@ -48,7 +48,7 @@ class Metrics:
             buckets[sum(seconds > limit for limit in _BUCKETS_S)] += 1
             self._sums[name] += seconds
 
-    def text(self, **gauges: float) -> str:
+    def text(self, **gauges: float | int) -> str:
         """All of them in Prometheus' text format, with some values of the moment."""
         with self._lock:
             return "\n".join([*self._counters(), *self._histograms(), *_gauges(gauges)]) + "\n"
@@ -78,7 +78,7 @@ def _header(name: str, kind: str) -> Iterator[str]:
     yield f"# TYPE {_PREFIX}{name} {kind}"
 
 
-def _gauges(gauges: dict[str, float]) -> Iterator[str]:
+def _gauges(gauges: Mapping[str, float | int]) -> Iterator[str]:
     for name, value in gauges.items():
         yield from _header(name, "counter" if name.endswith("_total") else "gauge")
         yield f"{_PREFIX}{name} {value:g}"

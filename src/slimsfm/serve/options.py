@@ -72,7 +72,10 @@ class ServeOptions:
     """Folder that images and their poses are written to. None: images are neither kept nor logged."""
 
     film: Path | None = None
-    """Folder of images that the page can play instead of a camera."""
+    """Video that the page can play instead of a camera."""
+
+    authority: Path | None = None
+    """Certificate of the authority that made the server's, for phones to fetch."""
 
     localization: LocalizationOptions = LocalizationOptions()
     """How images are localized."""

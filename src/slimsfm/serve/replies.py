@@ -7,6 +7,7 @@ import pycolmap
 
 from slimsfm.localization import Localization
 from slimsfm.mapping.map import Map
+from slimsfm.serve.geopose import geopose_of, is_georeferenced
 from slimsfm.serve.maps import ServedMap
 
 Json = dict[str, Any]
@@ -30,6 +31,7 @@ def map_reply(served: ServedMap) -> Json:
         "num_images": len(map_.images),
         "orientation": map_.info.orientation,
         "camera": None if camera is None else camera_reply(camera),
+        "georeferenced": is_georeferenced(map_),
     }
 
 
@@ -95,4 +97,5 @@ def localization_reply(served: ServedMap, found: Localization) -> Json:
         "camera_source": found.camera_source,
         "camera_estimated": list(found.camera_estimated),
         "orientation": found.orientation,
+        "geopose": pose and geopose_of(map_, pose.cam_from_world),
     }

@@ -68,6 +68,8 @@ class MapServer:
             self.certificate = _certificate(binding, listening)
             if not options.token and not listening.is_local:
                 options = replace(options, token=secrets.token_urlsafe(16))
+            if self.certificate and self.certificate.authority:
+                options = replace(options, authority=self.certificate.authority)
             self.options = options
             app = create_app(options)
         except BaseException:
