@@ -60,9 +60,7 @@ class MapServer:
             InputError: A map, the certificate or the port cannot be used.
         """
         if (binding.cert is None) != (binding.key is None):
-            raise InputError(
-                "cert: a certificate needs its key, and a key its certificate; give `cert=FILE` and `key=FILE`"
-            )
+            raise InputError("cert: a certificate and its key go together; give `cert=FILE` and `key=FILE`")
         listening = listen(binding.host, binding.port)
         try:
             self.certificate = _certificate(binding, listening)
