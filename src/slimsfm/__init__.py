@@ -46,10 +46,13 @@ if TYPE_CHECKING:
         reduce,
     )
     from slimsfm.report.tracked_video import track_video
+    from slimsfm.serve.client import AsyncClient, Client
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
 
 _MODULES = {
+    "AsyncClient": "slimsfm.serve.client",
     "BuildOptions": "slimsfm.mapping",
+    "Client": "slimsfm.serve.client",
     "FrontierOptions": "slimsfm.reduction",
     "Gravity": "slimsfm.pose",
     "ImageOptions": "slimsfm.reduction",
@@ -83,7 +86,9 @@ _MODULES = {
 """The module of each public name. A new name needs a line here, in `__all__` and in the imports above."""
 
 __all__ = [
+    "AsyncClient",
     "BuildOptions",
+    "Client",
     "FrontierOptions",
     "Gravity",
     "ImageOptions",

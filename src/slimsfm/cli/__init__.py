@@ -56,6 +56,7 @@ COMMANDS = {
     "track": Entry("track_command:track", "estimate the camera pose of every frame of a video"),
     "info": Entry("info_command:info", "show what a map contains"),
     "view": Entry("view_command:view", "show a map in the browser and localize images in it"),
+    "serve": Entry("serve_command:serve", "localize images that phones, robots and programs send"),
     "frontier": Entry("frontier_command:frontier_of", "compare the ways to reduce a map"),
     "graph": Entry("graph_command:graph", "compute which reference images localize which others"),
     "benchmark onepose": _benchmark("OnePose", "objects in OnePose's layout"),
