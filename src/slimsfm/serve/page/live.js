@@ -171,11 +171,13 @@ export class Live {
     const object = reply.found ? this.parts.objectOf(reply.map) : null;
     this.known = object && this.understood(reply, object, sent.captured);
     this.lastSeen = this.known ?? this.lastSeen;
-    if (this.known && manner(this.hasGyroscope, now - sent.captured) === "held") {
-      this.parts.viewer.show(sent.picture, this.size, this.known);
-    }
+    const { known } = this;
+    const how = known && manner(this.hasGyroscope, now - sent.captured);
+    if (how === "held") this.parts.viewer.show(sent.picture, this.size, known);
     this.parts.onFrameSent(sent.jpeg, reply);
-    this.report(reply, now - sent.captured, now);
+    if (!known) this.showNewest(this.newest);
+    if (known && how === "alone") this.waitFor(known);
+    else this.report(reply, now - sent.captured, now);
     this.sendNewest();
   }
 
