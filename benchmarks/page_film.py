@@ -181,7 +181,7 @@ RECORD = """
   step();
 })()
 """.replace("BITS", str(BITS))
-"""Script that notes time, number of the camera's frame and state of the page, again and again, in `record`."""
+"""Script that notes time, number of the camera's frame and state of the page, frame by frame, in `record`."""
 
 
 @dataclass(frozen=True, kw_only=True)
