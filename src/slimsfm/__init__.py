@@ -48,13 +48,21 @@ if TYPE_CHECKING:
     from slimsfm.report.tracked_video import track_video
     from slimsfm.serve.client import AsyncClient, Client
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
+    from slimsfm.upkeep.align import Distance, Gps, GravityUp, OtherMap, Positions, Tag, align
+    from slimsfm.upkeep.alignment import Alignment
+    from slimsfm.upkeep.positions import read_positions
+    from slimsfm.upkeep.transform import transformed
 
 _MODULES = {
+    "Alignment": "slimsfm.upkeep.alignment",
     "AsyncClient": "slimsfm.serve.client",
     "BuildOptions": "slimsfm.mapping",
     "Client": "slimsfm.serve.client",
+    "Distance": "slimsfm.upkeep.align",
     "FrontierOptions": "slimsfm.reduction",
+    "Gps": "slimsfm.upkeep.align",
     "Gravity": "slimsfm.pose",
+    "GravityUp": "slimsfm.upkeep.align",
     "ImageOptions": "slimsfm.reduction",
     "ImportOptions": "slimsfm.mapping",
     "Localization": "slimsfm.localization",
@@ -62,13 +70,17 @@ _MODULES = {
     "Localizer": "slimsfm.localization",
     "Map": "slimsfm.mapping",
     "MultiLocalizer": "slimsfm.localization",
+    "OtherMap": "slimsfm.upkeep.align",
     "PoseEstimate": "slimsfm.pose",
+    "Positions": "slimsfm.upkeep.align",
     "RansacOptions": "slimsfm.pose",
     "ReduceOptions": "slimsfm.reduction",
     "ReductionLimits": "slimsfm.reduction",
+    "Tag": "slimsfm.upkeep.align",
     "Tracked": "slimsfm.tracking",
     "Tracker": "slimsfm.tracking",
     "TrackerOptions": "slimsfm.tracking",
+    "align": "slimsfm.upkeep.align",
     "build_map": "slimsfm.mapping",
     "estimate_pose": "slimsfm.pose",
     "frontier": "slimsfm.reduction",
@@ -77,20 +89,26 @@ _MODULES = {
     "localize_objects": "slimsfm.localization",
     "read_image": "slimsfm.photos",
     "read_map": "slimsfm.mapping",
+    "read_positions": "slimsfm.upkeep.positions",
     "reduce": "slimsfm.reduction",
     "refine_pose": "slimsfm.pose",
     "track_video": "slimsfm.report.tracked_video",
+    "transformed": "slimsfm.upkeep.transform",
     "write_map": "slimsfm.mapping",
     "write_poses": "slimsfm.localization.pose_files",
 }
 """The module of each public name. A new name needs a line here, in `__all__` and in the imports above."""
 
 __all__ = [
+    "Alignment",
     "AsyncClient",
     "BuildOptions",
     "Client",
+    "Distance",
     "FrontierOptions",
+    "Gps",
     "Gravity",
+    "GravityUp",
     "ImageOptions",
     "ImportOptions",
     "Localization",
@@ -98,13 +116,17 @@ __all__ = [
     "Localizer",
     "Map",
     "MultiLocalizer",
+    "OtherMap",
     "PoseEstimate",
+    "Positions",
     "RansacOptions",
     "ReduceOptions",
     "ReductionLimits",
+    "Tag",
     "Tracked",
     "Tracker",
     "TrackerOptions",
+    "align",
     "build_map",
     "estimate_pose",
     "frontier",
@@ -113,9 +135,11 @@ __all__ = [
     "localize_objects",
     "read_image",
     "read_map",
+    "read_positions",
     "reduce",
     "refine_pose",
     "track_video",
+    "transformed",
     "write_map",
     "write_poses",
 ]

@@ -3,9 +3,13 @@
 import json as json_format
 from dataclasses import asdict
 
+import numpy as np
+import pycolmap
+
 from slimsfm.cli.options import MapPath
-from slimsfm.cli.output import console, counts, plural, print_notes, size
+from slimsfm.cli.output import console, counts, place_of, plural, print_notes, size
 from slimsfm.localization.calibration import CALIBRATED
+from slimsfm.mapping.georeference import Georeference
 from slimsfm.mapping.io import bytes_by_part, read_map
 from slimsfm.mapping.map import Map
 
@@ -41,6 +45,7 @@ def _facts(map: Map, sizes: dict[str, int]) -> dict:
         "verified_pairs": len(map.matches),
         "box": {"diagonal": box.diagonal, "source": info.box_source, "corners": box.corners.tolist()},
         "unit": info.unit,
+        "georeference": info.georeference and info.georeference.to_json(),
         "extractor": {
             "name": info.extractor,
             "options": info.extractor_options,
@@ -78,10 +83,17 @@ def _lines(map: Map, sizes: dict[str, int]) -> dict[str, str]:
         "points": points,
         **support,
         "box": f"{info.box_source}, diagonal {map.box.diagonal:.3g} {unit}",
+        **({"place": _place(info.georeference)} if info.georeference else {}),
         "extractor": info.extractor + (f" ({options})" if options else "") + uncalibrated,
         "pixels": _pixels(map),
         "size": ", ".join(f"{part} {size(number)}" for part, number in sizes.items()),
     }
+
+
+def _place(georeference: Georeference) -> str:
+    is_enu = np.allclose(georeference.enu_from_world.params, pycolmap.Sim3d().params)
+    axes = "axes east, north, up" if is_enu else "in a frame of its own"
+    return f"{place_of(georeference)} (origin); {axes}"
 
 
 def _pixels(map: Map) -> str:

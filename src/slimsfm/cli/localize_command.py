@@ -75,7 +75,8 @@ def localize(
     again: dict[str, Localization] = {}
     if also:
         by_object = localize_objects(MultiLocalizer(localizers), images, strict=strict, **shared)
-        write_object_poses(output, by_object, overwrite=overwrite)
+        infos = {name: one.map.info for name, one in localizers.items()}
+        write_object_poses(output, by_object, infos=infos, overwrite=overwrite)
     else:
         ((name, only),) = localizers.items()
         shared["gravity"] = read_gravity(gravity) if gravity else None
@@ -83,7 +84,7 @@ def localize(
         results = localize_images(only, images, strict=strict, **shared)
         again = localize_failed(fallback, results, images, **shared) if fallback else {}
         by_object = {name: {**results, **again}}
-        write_poses(output, by_object[name], overwrite=overwrite)
+        write_poses(output, by_object[name], info=only.map.info, overwrite=overwrite)
     found = _print(by_object, again)
     if again:
         saved = sum(one.pose is not None for one in again.values())

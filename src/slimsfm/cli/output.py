@@ -17,6 +17,7 @@ from slimsfm.cli.parsing import printable, with_flags
 from slimsfm.errors import OutputError
 from slimsfm.files import check_writable
 from slimsfm.files.space import check_place
+from slimsfm.mapping.georeference import Georeference
 from slimsfm.mapping.map import Map
 
 _WIDTH = 170  # of the widest table; a narrower terminal wraps lines, but no number is cut off
@@ -109,6 +110,14 @@ def size(num_bytes: float | int) -> str:
 def plural(number: int, one: str, many: str = "") -> str:
     """Write a number with its noun: 1 image, 2 images."""
     return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def place_of(georeference: Georeference) -> str:
+    """Where on Earth a map is, as text."""
+    latitude, longitude = georeference.latitude, georeference.longitude
+    north = f"{abs(latitude):.6f}° {'N' if latitude >= 0 else 'S'}"
+    east = f"{abs(longitude):.6f}° {'E' if longitude >= 0 else 'W'}"
+    return f"{north}, {east}, height {georeference.height:.1f} m"
 
 
 def finish(what: str, watch: Stopwatch, *next_command: Any) -> None:

@@ -75,7 +75,7 @@ def track(
     if tracked.skipped:
         poses = dict(sorted(poses.items()))  # images of a folder are read in this order
     seconds = {name: frames[name].frame_seconds if name in frames else None for name in poses}
-    write_poses(output, poses, seconds=seconds, overwrite=overwrite)
+    write_poses(output, poses, info=localizer.map.info, seconds=seconds, overwrite=overwrite)
     _sum_up(output, list(frames.values()))
     if tracked.ended_early:
         console.print(f"warning: {tracked.ended_early}", style="bold red")

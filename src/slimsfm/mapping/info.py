@@ -7,6 +7,7 @@ from typing import Any
 from slimsfm.devices import Device
 from slimsfm.files import plain
 from slimsfm.geometry import Box
+from slimsfm.mapping.georeference import Georeference
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.photos import Orientation
 
@@ -36,6 +37,9 @@ class MapInfo:
 
     unit: str = "unknown"
     """Unit of the map's frame: "metre", or "unknown" if SfM left the scale open."""
+
+    georeference: Georeference | None = None
+    """Where on Earth the map is; None if that is not known. `slimsfm.align` finds it."""
 
     origin: str
     """A sentence that says how the map was made."""

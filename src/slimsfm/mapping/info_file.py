@@ -14,6 +14,7 @@ from slimsfm.errors import InputError, MapError
 from slimsfm.files import contents_of, plain, read_json
 from slimsfm.files.checksums import COPY_AGAIN, Checksum, checksum_of_json, checksums_of
 from slimsfm.geometry import Box
+from slimsfm.mapping.georeference import Georeference
 from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.quality import quality_from_json
@@ -65,6 +66,7 @@ def _info_to_json(map: Map) -> dict:
             "source": info.box_source,
         },
         "unit": info.unit,
+        **({"georeference": info.georeference.to_json()} if info.georeference else {}),
         "origin": info.origin,
         "notes": list(info.notes),
         "orientation": info.orientation,
@@ -122,6 +124,7 @@ def _info_from_json(data: dict[str, Any]) -> MapInfo:
         box=Box(_numbers(data["box"]["center"], 3), _numbers(data["box"]["half_edges"], 3, 3)),
         box_source=data["box"]["source"],
         unit=data["unit"],
+        georeference=Georeference.from_json(data.get("georeference")),
         origin=data["origin"],
         notes=plain(data.get("notes", ()), tuple[str, ...]),
         quality=quality_from_json(data.get("quality")),

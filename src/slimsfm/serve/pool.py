@@ -58,7 +58,7 @@ class FairPool:
         """Number of jobs that wait."""
         return self._waiting
 
-    async def run(self, client: str, kind: str, work: Callable[[], T], deadline_s: float = inf) -> T:
+    async def run(self, client: str, kind: str, work: Callable[[], T], deadline_s: float | int = inf) -> T:
         """Run work on a thread when it is the client's turn.
 
         Args:
@@ -74,7 +74,7 @@ class FairPool:
         """
         return await asyncio.wrap_future(self._submit(client, kind, work, deadline_s))
 
-    def _submit(self, client: str, kind: str, work: Callable[[], T], deadline_s: float) -> "Future[T]":
+    def _submit(self, client: str, kind: str, work: Callable[[], T], deadline_s: float | int) -> "Future[T]":
         with self._changed:
             expected = self._mean_s.get(kind, _FIRST_GUESS_S)
             wait_s = self._predicted_wait_s(client)

@@ -60,9 +60,7 @@ class MapServer:
             InputError: A map, the certificate or the port cannot be used.
         """
         if (binding.cert is None) != (binding.key is None):
-            raise InputError(
-                "cert: a certificate needs its key, and a key its certificate; give `cert` and `key`"
-            )
+            raise InputError("cert: a certificate and its key go together; give `cert=FILE` and `key=FILE`")
         listening = listen(binding.host, binding.port)
         try:
             self.certificate = _certificate(binding, listening)
@@ -91,6 +89,11 @@ class MapServer:
             asyncio.run(self._server.serve(sockets=[self._socket]))
         finally:
             self._socket.close()
+
+    def close(self) -> None:
+        """Release the port and the workers of a server that was never run."""
+        self._socket.close()
+        self.service.pool.close()
 
     def stop(self) -> None:
         """Let `run`, on another thread, finish what runs and return."""

@@ -1,1 +1,1 @@
-"""Keep a map right and up to date: check and align it, add photos, merge maps, forget what is not needed."""
+"""Keep a map right and up to date: check its poses, align it to unit and place, add photos, merge, forget."""
