@@ -152,7 +152,7 @@ def test_the_hint_says_where_to_turn(direction):
 
 def test_what_is_shown_depends_on_the_gyroscope_and_the_age_of_the_pose():
     body = 'const { manner } = await load("live.js"); return asked.map(([has, age]) => manner(has, age))'
-    asked = [(False, 80), (False, 900), (True, 80), (True, 3000)]
+    asked = [(False, 80), (False, 2000), (True, 80), (True, 2000)]
     assert run(body, asked=asked) == ["held", "alone", "carried", "alone"]
 
 
