@@ -51,12 +51,11 @@ class NumberedFilm:
         outline = self.outline(index)
         if outline is None:
             return 0.0
-        low = np.floor(outline.min(axis=0)).astype(int)
-        high = np.ceil(outline.max(axis=0)).astype(int) + 1
-        filled = filled_polygon(outline - low, (high[1] - low[1], high[0] - low[0]))
-        left, top = np.maximum(-low, 0)
-        right, bottom = (np.array([self.camera.width, self.camera.height]) - low).clip(0)
-        return float(filled[top:bottom, left:right].sum() / max(1, filled.sum()))
+        right, bottom = self.camera.width, self.camera.height
+        frame = np.array([(0, 0), (right, 0), (right, bottom), (0, bottom)], np.float32)
+        hull = outline.astype(np.float32)
+        inside, _ = cv2.intersectConvexConvex(hull, frame)
+        return float(inside / cv2.contourArea(hull))
 
     def write(self, path: Path, frames_per_second: int) -> None:
         """Write the film as uncompressed y4m, with the numbers in its frames."""
@@ -161,11 +160,10 @@ HTMLCanvasElement.prototype.getContext = function (kind, options) {
 """
 """Script after which the pixels of canvases can be read at any time."""
 
-RECORD = (
-    """
+RECORD = """
 (() => {
   const cells = document.createElement("canvas");
-  const [bits, video] = [%d, document.getElementById("video")];
+  const [bits, video] = [BITS, document.getElementById("video")];
   cells.width = 2 + 2 * bits;
   cells.height = 1;
   const context = cells.getContext("2d", { willReadFrequently: true });
@@ -182,10 +180,8 @@ RECORD = (
   };
   step();
 })()
-"""
-    % BITS
-)  # noqa: UP031 - braces of JavaScript
-"""Script that notes time, number of the camera's frame and the page's state, again and again, in `record`."""
+""".replace("BITS", str(BITS))
+"""Script that notes time, number of the camera's frame and state of the page, frame by frame, in `record`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +195,7 @@ class Return:
     """From the first frame with the object to the page's finding it; infinite if it did not."""
 
 
-def returns(film: NumberedFilm, record: Iterable[tuple[float, int, str]], least: float = 0.9) -> list[Return]:
+def returns(film: NumberedFilm, record: Iterable[tuple[float, int, str]], least: float = 0.8) -> list[Return]:
     """Each return of the object into sight, from a record of `RECORD`.
 
     Args:

@@ -3,10 +3,10 @@
     python benchmarks/page_overlap.py -o /tmp/page
 
 A headless Chromium has a rendered film as its camera: a hand walks around a printed box among clutter, and
-looks away for a second. The pixels that the page shows tell which frame of the film it is (a bar code) and where
-the box is drawn. Their overlap with the true outline in this frame, intersection over union, includes all that
-can be wrong: the pose, the intrinsics, the painter, and whether picture and pose belong together. Writes
-OUTPUT/map, OUTPUT/film-30.y4m and the pictures of the best and the worst overlap.
+looks away for a second. The pixels that the page shows tell which frame of the film it is (a bar code) and
+where the box is drawn. Their overlap with the true outline in this frame, intersection over union, includes
+all that can be wrong: the pose, the intrinsics, the painter, and whether picture and pose belong together.
+Writes OUTPUT/map, OUTPUT/film-30.y4m and the pictures of the best and the worst overlap.
 """
 
 import argparse
@@ -160,7 +160,7 @@ def measured(film: NumberedFilm, page: Page, options: argparse.Namespace) -> Ite
     extremes: dict[str, float] = {}
     for picture, state in pictures(page, film, options.seconds):
         found = overlap(film, picture) if state == "found" else None
-        if found is None or film.visible_share(found[0]) < 1:
+        if found is None or film.visible_share(found[0]) < 0.999:
             continue
         for name, better in (("worst", min), ("best", max)):
             if better(found[1], extremes.get(name, found[1])) == found[1]:

@@ -173,7 +173,7 @@ def _colors(part: trimesh.Trimesh) -> Float64[np.ndarray, "n 3"]:
 
 
 def _with_texture(part: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A part whose material is an image alone, white where it had none: one texture can then hold all parts'."""
+    """A part whose material is an image alone, white if it had none: these can be joined into one."""
     image = _image(part)
     if image is None:
         image, uv = PillowImage.new("RGB", (4, 4), (255, 255, 255)), np.full((len(part.vertices), 2), 0.5)

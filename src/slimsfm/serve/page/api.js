@@ -22,8 +22,8 @@ export class Api {
     return address.href;
   }
 
-  /** @param {string} path @param {RequestInit} [options] @returns {Promise<any>} */
-  async json(path, options = {}) {
+  /** @param {string} path @param {RequestInit} [options] @returns {Promise<Response>} */
+  async get(path, options = {}) {
     const headers = this.token ? { Authorization: `Bearer ${this.token}` } : undefined;
     let response;
     try {
@@ -31,14 +31,24 @@ export class Api {
     } catch {
       throw new RequestError("The server does not answer. Does it still run?");
     }
+    if (response.ok) return response;
     const body = await response.json().catch(() => null);
-    if (!response.ok) throw new RequestError(body?.error?.message ?? `The server answered ${response.status}.`);
-    return body;
+    throw new RequestError(body?.error?.message ?? `The server answered ${response.status}.`);
   }
 
-  /** All maps. @returns {Promise<any[]>} */
-  async maps() {
-    return (await this.json("v1/maps")).maps;
+  /** @param {string} path @param {RequestInit} [options] @returns {Promise<any>} */
+  async json(path, options) {
+    return (await this.get(path, options)).json();
+  }
+
+  /** All maps, and whether there is a film to play instead of a camera. @returns {Promise<{maps: any[], film?: boolean}>} */
+  maps() {
+    return this.json("v1/maps");
+  }
+
+  /** The film. */
+  async film() {
+    return (await this.get("v1/film")).blob();
   }
 
   /** @param {string} id */

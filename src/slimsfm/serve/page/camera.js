@@ -47,8 +47,8 @@ export async function listCameras() {
   return devices.filter((device) => device.kind === "videoinput");
 }
 
-/** Play a video file again and again. @param {HTMLVideoElement} video @param {File} file @returns {Promise<Source>} */
-export async function openVideo(video, file) {
+/** Play a video again and again. @param {HTMLVideoElement} video @param {Blob} file @param {string} name @returns {Promise<Source>} */
+export async function openVideo(video, file, name) {
   const address = URL.createObjectURL(file);
   video.src = address;
   video.loop = true;
@@ -61,9 +61,9 @@ export async function openVideo(video, file) {
     await video.play();
   } catch {
     stop();
-    throw new Error(`${file.name}: this browser cannot play it.`);
+    throw new Error(`${name}: this browser cannot play it.`);
   }
-  return { label: `video ${file.name}`, turnsWithDevice: false, stop };
+  return { label: `video ${name}`, turnsWithDevice: false, stop };
 }
 
 /**

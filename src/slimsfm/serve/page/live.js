@@ -9,8 +9,9 @@
  * - Without, the frame that was sent is kept, and shown when its answer comes. The drawing then fits exactly at any
  *   speed, and the picture is late by the time of an answer, which is less visible than a box that swims.
  *
- * Answers may take longer, on a slow network. A pose is then carried for CARRY_MS; without a gyroscope, a picture is not
- * held back for more than HOLD_MS: the newest is shown with nothing on it, because no box is better than a wrong one.
+ * Answers may take longer, on a slow network. A pose is then carried for CARRY_MS, because the gyroscope does not know
+ * that the camera moved aside; a picture is held back for HOLD_MS. After that the newest picture is shown with nothing
+ * on it: no box is better than a wrong one.
  */
 import { cameraFrom } from "./cameras.js";
 import { Encoder, FRAME_SIDE, fitted } from "./encoding.js";
@@ -25,7 +26,7 @@ import { watchFrames } from "./camera.js";
  * @typedef {{state: import("./states.js").State, name: string, confidence: number | null, direction: string, lag: number, rate: number, ms: any}} Report
  */
 
-const HOLD_MS = 500;
+const HOLD_MS = 1500;
 const CARRY_MS = 1000;
 
 /**
@@ -136,7 +137,7 @@ export class Live {
     const how = known ? manner(this.hasGyroscope, captured - known.captured) : "alone";
     if (how === "held") return;
     const overlay = known && how === "carried" ? { ...known, pose: this.carried(known, captured) } : null;
-    viewer.show(video, this.size, overlay, known ? null : preview());
+    viewer.show(video, this.size, overlay, this.state === "searching" || this.state === "lost" ? preview() : null);
     if (known && how === "alone") this.waitFor(known);
   }
 
@@ -171,11 +172,13 @@ export class Live {
     const object = reply.found ? this.parts.objectOf(reply.map) : null;
     this.known = object && this.understood(reply, object, sent.captured);
     this.lastSeen = this.known ?? this.lastSeen;
-    if (this.known && manner(this.hasGyroscope, now - sent.captured) === "held") {
-      this.parts.viewer.show(sent.picture, this.size, this.known);
-    }
+    const { known } = this;
+    const how = known && manner(this.hasGyroscope, now - sent.captured);
+    if (how === "held") this.parts.viewer.show(sent.picture, this.size, known);
     this.parts.onFrameSent(sent.jpeg, reply);
-    this.report(reply, now - sent.captured, now);
+    if (!known) this.showNewest(this.newest);
+    if (known && how === "alone") this.waitFor(known);
+    else this.report(reply, now - sent.captured, now);
     this.sendNewest();
   }
 

@@ -68,11 +68,19 @@ class Page {
   }
 
   async load() {
-    this.maps = await this.api.maps();
+    const { maps, film } = await this.api.maps();
+    this.maps = maps;
+    element("film").hidden = !film;
     const all = this.maps.length > 1 ? [{ value: "", label: "All objects" }] : [];
     this.panel.fill("map", [...all, ...this.maps.map(({ id }) => ({ value: id, label: id }))], "");
     if (this.maps.length === 1) this.objectOf(this.maps[0].id);
     this.panel.say("idle", "Ready", "Start the camera, or drop a photo or a video here.");
+    if (film && new URLSearchParams(location.search).has("film")) await this.playFilm();
+  }
+
+  /** Play the server's film as the camera. */
+  playFilm() {
+    return this.play(async () => openVideo(element("video"), await this.api.film(), "film"));
   }
 
   /** What is drawn of a map; null until its box has come. @param {string} id */
@@ -162,7 +170,7 @@ class Page {
   /** @param {File | undefined} file A photo or a video. */
   async open(file) {
     if (!file) return;
-    if (file.type.startsWith("video/")) return this.play(() => openVideo(element("video"), file));
+    if (file.type.startsWith("video/")) return this.play(() => openVideo(element("video"), file, file.name));
     this.stop();
     this.panel.say("starting", "Looking …");
     try {
@@ -200,6 +208,7 @@ class Page {
 /** @param {Page} page */
 function listen(page) {
   element("start").addEventListener("click", () => page.startCamera());
+  element("film").addEventListener("click", () => page.playFilm());
   element("stop").addEventListener("click", () => {
     page.stop();
     page.panel.say("idle", "Stopped", "Start the camera, or drop a photo or a video here.");

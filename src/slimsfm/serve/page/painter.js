@@ -139,6 +139,17 @@ export class Painter {
     this.gl.viewport(part.x, part.y, part.width, part.height);
   }
 
+  /** Fill a part of the canvas, and draw there from now on. @param {Rectangle} part @param {Rgb} color */
+  blank(part, color) {
+    const { gl } = this;
+    this.within(part);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(part.x, part.y, part.width, part.height);
+    gl.clearColor(...color, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.disable(gl.SCISSOR_TEST);
+  }
+
   /** @param {Shape} shape @param {Eye} eye @param {{width: number, opacity?: number, paint?: Rgb, deep?: boolean}} style Width in pixels; one color for all; whether the mesh hides lines. */
   drawLines(shape, eye, { width, opacity = 1, paint, deep = false }) {
     const { gl } = this;
@@ -152,12 +163,13 @@ export class Painter {
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, shape.count);
   }
 
-  /** @param {Shape} shape @param {Eye} eye @param {{width: number, opacity?: number}} style Width in pixels. */
-  drawPoints(shape, eye, { width, opacity = 1 }) {
+  /** @param {Shape} shape @param {Eye} eye @param {{width: number, opacity?: number, core?: number}} style Width in pixels; share of it within the dark rim. */
+  drawPoints(shape, eye, { width, opacity = 1, core = 0.62 }) {
     const { gl } = this;
     const { uniforms } = this.begin("points", eye, { blend: true, deep: false });
     gl.uniform1f(uniforms.get("width"), width);
     gl.uniform1f(uniforms.get("opacity"), opacity);
+    gl.uniform1f(uniforms.get("core"), core);
     gl.bindVertexArray(shape.array);
     gl.drawArrays(gl.POINTS, 0, shape.count);
   }

@@ -87,13 +87,13 @@ void main() {
 }`,
   fragment: `#version 300 es
 precision mediump float;
-uniform float opacity;
+uniform float opacity, core;
 in vec3 shade;
 out vec4 color;
 void main() {
   float away = 2.0 * length(gl_PointCoord - 0.5);
   if (away > 1.0) discard;
-  color = vec4(away > 0.62 ? vec3(0.0) : shade, 1.0) * opacity;
+  color = vec4(away > core ? vec3(0.0) : shade, 1.0) * opacity;
 }`,
 };
 

@@ -1,5 +1,5 @@
 /** The canvas: a picture with what is drawn over it, as large as fits. */
-import { DrawnObject } from "./objects.js";
+import { COLORS, DrawnObject } from "./objects.js";
 import { Painter } from "./painter.js";
 import { fromRotationVector, multiply, rotate, times } from "./pose.js";
 
@@ -9,7 +9,7 @@ import { fromRotationVector, multiply, rotate, times } from "./pose.js";
  */
 
 const MAX_DENSITY = 2; // canvas pixels per CSS pixel; more costs time and shows nothing
-const PREVIEW_SHARE = 0.36;
+const PREVIEW_SHARE = 0.3;
 const PREVIEW_TURN_S = 12;
 
 export class Viewer {
@@ -69,15 +69,16 @@ export class Viewer {
     else if (preview?.points) this.drawPreview(preview);
   }
 
-  /** The turning points of an object in a corner: this is what to look for. @param {DrawnObject} object */
+  /** The turning points of an object, at the top right: this is what to look for. @param {DrawnObject} object */
   drawPreview(object) {
     const part = this.part();
     const side = Math.round(PREVIEW_SHARE * Math.min(part.width, part.height));
-    const margin = Math.round(0.03 * side);
-    this.painter.within({ x: part.x + part.width - side - margin, y: part.y + margin, width: side, height: side });
+    const margin = Math.round(0.06 * side);
+    const corner = { x: part.x + part.width - side - margin, y: part.y + part.height - side - margin };
+    this.painter.blank({ ...corner, width: side, height: side }, COLORS.rim);
     const camera = { width: 1, height: 1, fx: 1.6, fy: 1.6, cx: 0.5, cy: 0.5, distortion: /** @type {[number, number, number, number]} */ ([0, 0, 0, 0]) };
     const eye = object.eye(orbit(object, performance.now() / 1000 / PREVIEW_TURN_S), camera);
-    if (object.points) this.painter.drawPoints(object.points, eye, { width: Math.max(2, side / 60), opacity: 0.85 });
+    if (object.points) this.painter.drawPoints(object.points, eye, { width: Math.max(2, side / 70), core: 1 });
   }
 }
 
