@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import time
+from collections.abc import Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -23,18 +24,19 @@ _COMPLAINTS = ("error", "warning", "assert")
 
 
 @contextmanager
-def open_page(path: Path, profile: Path):
-    """Open the page of a file; `profile` is an empty folder for the browser's state."""
+def open_page(where: Path | str, profile: Path, flags: Sequence[str] = ()):
+    """Open the page of a file or an address; `profile` is an empty folder for the browser's state."""
     program = next((found for name in _PROGRAMS if (found := shutil.which(name))), None)
     if program is None:
         pytest.skip(f"browsing needs one of {', '.join(_PROGRAMS)}, none of which is installed")
-    flags = ("--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--remote-allow-origins=*")
+    always = ("--headless=new", "--no-sandbox", "--remote-debugging-port=0", "--remote-allow-origins=*")
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen([program, *flags, f"--user-data-dir={profile}", "about:blank"], **quiet)
+    command = [program, *always, *flags, f"--user-data-dir={profile}", "about:blank"]
+    process = subprocess.Popen(command, **quiet)
     try:
         page = Page(_address(process, profile / "DevToolsActivePort"))
         try:
-            page.open(path)
+            page.open(where)
             yield page
         finally:
             page.close()
@@ -79,12 +81,17 @@ class Page:
                 return message["result"]
             self.events.append(message)
 
-    def open(self, path: Path) -> None:
-        """Open a file and wait until it is loaded and drawn."""
-        self.send("Page.navigate", url=path.absolute().as_uri())
-        while not any(event["method"] == "Page.loadEventFired" for event in self.events):
+    def open(self, where: Path | str) -> None:
+        """Open a file or an address and wait until it is loaded and drawn."""
+        seen = len(self.events)
+        self.send("Page.navigate", url=where.absolute().as_uri() if isinstance(where, Path) else where)
+        while not any(event["method"] == "Page.loadEventFired" for event in self.events[seen:]):
             self.events.append(json.loads(self._socket.recv()))
         self.settle()
+
+    def prepare(self, script: str) -> None:
+        """Run a script at the beginning of every page that is opened from now on."""
+        self.send("Page.addScriptToEvaluateOnNewDocument", source=script)
 
     def settle(self) -> None:
         """Wait until pending changes are drawn."""
@@ -92,10 +99,17 @@ class Page:
         self.send("Runtime.evaluate", expression=frame, awaitPromise=True)
 
     def run(self, script: str):
-        """The value of an expression on the page."""
-        found = self.send("Runtime.evaluate", expression=script, returnByValue=True)
+        """The value of an expression on the page, or of its promise."""
+        found = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
+
+    def wait_for(self, script: str, patience_s: float = _PATIENCE_S) -> None:
+        """Wait until an expression is true."""
+        deadline = time.monotonic() + patience_s
+        while not self.run(script):
+            assert time.monotonic() < deadline, f"{script} did not become true; {self.complaints()}"
+            time.sleep(0.02)
 
     def resize(self, width: int, height: int, *, mobile: bool = False) -> None:
         """Resize the window."""

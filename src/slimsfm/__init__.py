@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         reduce,
     )
     from slimsfm.report.tracked_video import track_video
+    from slimsfm.serve.client import AsyncClient, Client
     from slimsfm.tracking import Tracked, Tracker, TrackerOptions
     from slimsfm.upkeep.add import Addition, AddOptions, add
     from slimsfm.upkeep.align import Distance, Gps, GravityUp, OtherMap, Positions, Tag, align
@@ -63,7 +64,9 @@ _MODULES = {
     "AddOptions": "slimsfm.upkeep.add",
     "Addition": "slimsfm.upkeep.add",
     "Alignment": "slimsfm.upkeep.alignment",
+    "AsyncClient": "slimsfm.serve.client",
     "BuildOptions": "slimsfm.mapping",
+    "Client": "slimsfm.serve.client",
     "Distance": "slimsfm.upkeep.align",
     "ForgetOptions": "slimsfm.upkeep.forget",
     "Forgetting": "slimsfm.upkeep.forget",
@@ -119,7 +122,9 @@ __all__ = [
     "AddOptions",
     "Addition",
     "Alignment",
+    "AsyncClient",
     "BuildOptions",
+    "Client",
     "Distance",
     "ForgetOptions",
     "Forgetting",

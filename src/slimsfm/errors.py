@@ -9,6 +9,7 @@
     ├── OutputError             a result cannot be written where the user asked
     │   └── OutputExistsError   ... because it exists and may not be overwritten
     ├── ReconstructionError     Structure from Motion found no model in the images
+    ├── ServerError             a server of maps refused a request, or does not answer
     └── WorkError               a task on other processes or machines failed repeatedly
 
 A bad value in Python code is a plain `ValueError` that names the argument. An image that cannot be localized
@@ -54,3 +55,16 @@ class ReconstructionError(SlimsfmError):
 
 class WorkError(SlimsfmError):
     """A task on other processes or machines failed repeatedly."""
+
+
+class ServerError(SlimsfmError):
+    """A server of maps refused a request, or does not answer.
+
+    Attributes:
+        status: The status of HTTP; 0 if no answer came.
+        code: What went wrong, in a word for programs; empty if no answer came.
+    """
+
+    def __init__(self, message: str, status: int = 0, code: str = "") -> None:
+        super().__init__(message)
+        self.status, self.code = status, code

@@ -126,7 +126,7 @@ def read_exif(path: str | Path) -> Exif:
         has_crop = _HAS_CROP.search(_xmp(file)) is not None
     found = {name: exif[key] for name, key in _FOCAL_LENGTHS.items() if key in exif}
     in_35mm = number(found.get("FocalLengthIn35mmFilm", 0))
-    focal = _inferred_focal(path)
+    focal = _inferred_focal(path) if exif else None  # COLMAP decodes the image to find that it has no EXIF
     if focal is None and in_35mm > 0:  # a format that COLMAP does not read
         focal = focal_of_film(in_35mm, size)
     is_possible = focal is not None and is_possible_focal(focal, max(size))

@@ -280,8 +280,8 @@ def _not_negative(values: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*
 
 
 @contextmanager
-def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
-    """Open an image file by Pillow, HEIC included.
+def opened_image(path: str | Path, *, any_size: bool = False) -> Iterator[PillowImage.Image]:
+    """Open an image file by Pillow, HEIC included; of any size only to look at its header.
 
     Raises:
         ImageError: It is a HEIC photo, and the package for them is missing, or it has more pixels than the
@@ -292,7 +292,8 @@ def opened_image(path: str | Path) -> Iterator[PillowImage.Image]:
         if head[4:8] == b"ftyp" and head[8:] in _HEIC_BRANDS and not _register_heic() and head[8:] != b"mif1":
             raise ImageError(f"{path}: {INSTALL_HEIC}")
         with _open(raw) as file:
-            check_pixels(path, *file.size)
+            if not any_size:
+                check_pixels(path, *file.size)
             yield file
 
 

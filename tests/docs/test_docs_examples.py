@@ -17,6 +17,7 @@ NOT_TYPED = (
     "pip install ",  # the tests run with the installed packages
     "ffmpeg ",  # the Python lines next to it do the same
     "slimsfm demo",  # it has its own test
+    "slimsfm serve ",  # runs until it is stopped
     "slimsfm view ",  # runs until it is stopped
     "slimsfm align map -o metric --tag-size",  # no tag is in these photos; tests/upkeep has some
     "slimsfm align map -o placed --gps",  # nor GPS

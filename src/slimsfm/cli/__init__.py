@@ -59,6 +59,7 @@ COMMANDS = {
     "align": Entry("align_command:align_map", "give a map its unit and its place: metres, up, Earth"),
     "info": Entry("info_command:info", "show what a map contains"),
     "view": Entry("view_command:view", "show a map in the browser and localize images in it"),
+    "serve": Entry("serve_command:serve", "localize images that phones, robots and programs send"),
     "frontier": Entry("frontier_command:frontier_of", "compare the ways to reduce a map"),
     "check": Entry("check_command:check", "find wrong poses and weak parts of a map, and repair them"),
     "graph": Entry("graph_command:graph", "compute which reference images localize which others"),

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from threading import Lock
 from typing import Any
-from urllib.parse import urlsplit
 
 from websockets.asyncio import server as websockets_server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from slimsfm.errors import InputError
+from slimsfm.hosts import host_of, is_this_machine
 
 Answer = Callable[[Any, Request], Response | None]
 """Takes a connection and a request; returns the response, or None to open a WebSocket."""
@@ -43,9 +43,9 @@ class Access:
     def refusal(self, request: Request) -> str | None:
         """Why a request is refused; None if it is not."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or not (self.token or _is_this_machine(hosts[0])):
+        if len(hosts) != 1 or not (self.token or is_this_machine(hosts[0])):
             return "the host must be this machine"
-        if any(_host_of(origin) != hosts[0].lower() for origin in origins):
+        if any(host_of(origin) != hosts[0].lower() for origin in origins):
             return "only the page of the view itself may connect"
         first = request.path.partition("?")[0].split("/")[1:2]
         if self.token and not hmac.compare_digest("".join(first).encode(), self.token.encode()):
@@ -65,21 +65,6 @@ class Access:
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
 
         return answer_allowed
-
-
-def _host_of(origin: str) -> str:
-    try:
-        return urlsplit(origin).netloc.lower()
-    except ValueError:
-        return ""
-
-
-def _is_this_machine(host: str) -> bool:
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-        return name == "localhost" or ip_address(name).is_loopback
-    except ValueError:
-        return False
 
 
 @contextmanager
