@@ -35,14 +35,14 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def read(path, folder, seconds=None, unit=None, orientation="upright"):
+def read(path, folder, seconds=None, unit=None):
     found = names(folder)
     return pose_photos(
         read_given(path),
         PhotosToPose(folder=folder, names=found, seconds=seconds or {}),
         lambda some: {name: read_exif(folder / name) for name in some},
         sharing="auto",
-        orientation=orientation,
+        orientation="upright",
         unit=unit,
     )
 

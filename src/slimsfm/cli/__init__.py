@@ -49,7 +49,7 @@ def _benchmark(dataset: str, summary: str) -> Entry:
 
 
 COMMANDS = {
-    "build": Entry("build_command:build_photos", "make a map from a folder of photos"),
+    "build": Entry("build_command:build_photos", "make a map from photos and videos"),
     "import": Entry("import_command:import_", "make a map from a COLMAP model or hloc output"),
     "reduce": Entry("reduce_command:reduce", "keep only what localization needs, and predict the loss"),
     "add": Entry("add_command:add_photos", "add photos to a map, without moving what it has"),

@@ -43,8 +43,8 @@ def triangulate_known(
     """Triangulate the matches of a database from known poses.
 
     The poses stay as they are or, with `KnownPoses.refine`, are adjusted together with the points. Then the
-    given camera centers are observations with a standard deviation of 1 % of their spread, which keeps frame
-    and unit, also of parts of the model that share no point.
+    given camera centers are observations with a standard deviation of 1 % of their spread, and the result is
+    turned as one to the given rotations, which keeps frame and unit, also of parts that share no point.
 
     Poses of a file are as exact as the device that measured them. The less exact, by the matches, the larger
     are the errors that points may have.
@@ -93,7 +93,26 @@ def _adjusted(
     if spread > 0 and len(seeing) > 1:
         _adjust(model, given, seeing, _SPREAD * spread)
     adjusted = {model.image(i).name: model.image(i).cam_from_world() for i in seeing}
+    adjusted = _turned_back(adjusted, given)
     return {name: adjusted.get(name, pose) for name, pose in given.items()}
+
+
+def _turned_back(
+    adjusted: Mapping[str, pycolmap.Rigid3d], given: Mapping[str, pycolmap.Rigid3d]
+) -> dict[str, pycolmap.Rigid3d]:
+    """Poses turned and moved as one to the given ones, because centers on a line let the world turn about it.
+
+    The mean of the rotations (chordal) and of the centers are then those of the given poses.
+    """
+    if not adjusted:
+        return {}
+    turns = [given[name].rotation.matrix().T @ pose.rotation.matrix() for name, pose in adjusted.items()]
+    left, _, right = np.linalg.svd(np.sum(turns, axis=0))
+    turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    centers = np.mean([pose.inverse().translation for pose in adjusted.values()], axis=0)
+    goal = np.mean([given[name].inverse().translation for name in adjusted], axis=0)
+    given_from_adjusted = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), goal - turn @ centers)
+    return {name: pose * given_from_adjusted.inverse() for name, pose in adjusted.items()}
 
 
 def _adjust(
