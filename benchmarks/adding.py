@@ -23,6 +23,7 @@ import pycolmap
 from posed_scenes import read_transforms
 from slimsfm.cli.output import quiet
 from slimsfm.datasets.reconstructed import query_names
+from slimsfm.errors import InputError
 from slimsfm.geometry import ADD_FRACTIONS, Box, corner_error
 from slimsfm.image_files import list_images
 from slimsfm.localization import Localizer, localize_images
@@ -106,7 +107,13 @@ def main() -> None:
         place = work / f"portion{portion}"
         photos = linked(folder, [*rest[portion::_PORTIONS], *left_out], place / "photos")
         start = process_time()
-        found = add(grown, photos, workspace=place / "add", progress=shown)
+        try:
+            found = add(grown, photos, workspace=place / "add", progress=shown)
+        except InputError as error:  # those that could be added may come with a later portion
+            seconds.append(process_time() - start)
+            left_out = [*left_out, *rest[portion::_PORTIONS]]
+            print(error)
+            continue
         write_map(found.map, place / "map", overwrite=True)
         seconds.append(process_time() - start)
         grown, left_out = read_map(place / "map"), list(found.left_out)
