@@ -118,7 +118,8 @@ def main() -> None:
         seconds.append(process_time() - start)
         grown, left_out = read_map(place / "map"), list(found.left_out)
         print(f"portion {portion + 1}: {len(found.added)} added; not: {dict(found.left_out)}")
-    again = add(grown, work / "portion0" / "photos")
+    added = sorted(grown.images.keys() - first.images.keys())
+    again = add(grown, linked(folder, added, work / "again"))
     poses, box = true_poses(known, arguments.truth, at_once)
     moved = sum(
         not np.array_equal(image.cam_from_world().matrix(), grown.images[name].cam_from_world().matrix())
@@ -140,7 +141,7 @@ def main() -> None:
         print(f"| {title} | {len(one.images)} | {took:.0f} | {shares} | {np.median(measured):.5f} d |")
     print(f"\nold poses that moved: {moved} of {len(first.images)}")
     print(f"CPU seconds of the portions: {', '.join(f'{one:.0f}' for one in seconds)}")
-    print(f"the first portion again: {len(again.added)} added, {len(again.known)} known")
+    print(f"the added photos again: {len(again.added)} added, {len(again.known)} known")
 
 
 def true_poses(
