@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+from PIL import Image
 
 from commands import slimsfm
 from slimsfm.mapping.io import read_map, write_map
@@ -28,10 +29,12 @@ def grown(boulder, tmp_path_factory):
 
 def test_add_says_what_was_gained(grown):
     folder, taken, outcome = grown
-    assert f"{len(taken)} photos added in 1 round" in outcome.out
+    assert "photos added in " in outcome.out
     assert "coverage: " in outcome.out
     assert "queries lost: " in outcome.out
-    assert set(taken) <= set(read_map(folder / "larger").images)
+    added = set(taken) & set(read_map(folder / "larger").images)
+    assert len(added) >= 2
+    assert all(f"not added: {name}: " in outcome.out for name in set(taken) - added)
 
 
 def test_adding_again_copies_the_map(grown):
@@ -48,7 +51,7 @@ def test_adding_again_copies_the_map(grown):
 def test_a_reduction_is_repeated_on_the_larger_map(grown):
     folder, _, _ = grown
     for arguments in (
-        (folder / "map", "-o", folder / "small", "--selector", "kcover", "--max-points", 40),
+        (folder / "map", "-o", folder / "small", "--selector", "kcover", "--max-points", 150),
         (folder / "larger", "--as", folder / "small", "-o", folder / "small2"),
     ):
         outcome = slimsfm("reduce", *arguments)
@@ -57,7 +60,7 @@ def test_a_reduction_is_repeated_on_the_larger_map(grown):
     assert small["parent"]["path"] == "../map"
     assert again["parent"]["path"] == "../larger"
     assert small["parent"]["options"] == again["parent"]["options"]
-    assert len(read_map(folder / "small2").point3D_ids) <= 40
+    assert len(read_map(folder / "small2").point3D_ids) <= 150
     refused = slimsfm("add", folder / "small", folder / "new", "-o", folder / "none")
     assert refused.code == 2
     assert f"{folder / 'map'}, which it was made from" in refused.err
@@ -70,8 +73,6 @@ def test_a_reduction_is_repeated_on_the_larger_map(grown):
 
 
 def test_photos_of_another_place_write_nothing(grown, tmp_path):
-    from PIL import Image
-
     folder, _, _ = grown
     (tmp_path / "photos").mkdir()
     Image.effect_noise((320, 240), 80).convert("RGB").save(tmp_path / "photos" / "x.png")

@@ -146,7 +146,7 @@ def test_photos_enter_when_their_neighbors_have(half, tmp_path):
     side = keep_images(half.full, names[:6], min_track_length=2)
     found = add(side, half.some(names[6:16:2], tmp_path / "photos"))
     assert found.rounds > 1
-    assert len(found.added) > 2
+    assert len(found.added) > 1
     for name in found.added:
         assert half.error(found.map, name) < 0.05
 

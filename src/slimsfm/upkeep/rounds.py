@@ -12,7 +12,7 @@ from slimsfm.execution import map_on_threads, num_cores
 from slimsfm.lenses import camera_fault
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import QueryCamera
-from slimsfm.localization.round_result import SURE, SearchResult
+from slimsfm.localization.round_result import SearchResult
 from slimsfm.localization.shared_cameras import share_cameras
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.cameras import camera_key
@@ -32,7 +32,7 @@ _TRUSTED = ("given", "map")  # sources of intrinsics that are not refined
 class AddOptions:
     """How photos are added to a map."""
 
-    min_confidence: float = SURE
+    min_confidence: float = 0.9
     """Confidence that a pose needs, from 0 to 1. Photos below it are tried again when others have entered."""
 
     matcher: str = "nearest"
