@@ -33,9 +33,8 @@ def find_threads(
     graph = nx.Graph()
     graph.add_nodes_from(name for name in sorted(names) if name not in wrong)
     for (a, b), share in sorted(agreeing.items()):
-        count = round(share * len(matches[a, b]))
-        if share >= MIN_AGREEING and count and a in graph and b in graph:
-            graph.add_edge(a, b, count=count)
+        if a in graph and b in graph:  # what contradicts the map does not hold it together
+            graph.add_edge(a, b, count=round(share * len(matches[a, b])) if share >= MIN_AGREEING else 0)
     best = [max((d["count"] for *_, d in graph.edges(name, data=True)), default=0) for name in graph]
     usual = int(np.median(best or [0]))
     tree = nx.maximum_spanning_tree(graph, weight="count")
