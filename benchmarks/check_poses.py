@@ -23,7 +23,7 @@ from posed_scenes import posed
 from slimsfm.evaluation.results import evaluate
 from slimsfm.mapping import Map, read_map
 from slimsfm.upkeep import check, repair
-from wrong_poses import made_wrong
+from wrong_maps import made_wrong
 
 
 def rows(scene: Scene, shares: list[float], seeds: int) -> Iterator[list]:
