@@ -53,6 +53,7 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
     return MapCheck(
         images=len(names),
         pairs=len(agreeing),
+        agreeing_pairs=sum(share >= MIN_AGREEING for share in agreeing.values()),
         matches_from="map" if map.matches else "matched again",
         usual_error=_usual_error(verdicts),
         wrong=wrong,
