@@ -24,7 +24,7 @@ from slimsfm.evaluation.results import evaluate
 from slimsfm.mapping import Map, read_map
 from slimsfm.upkeep.checking import check
 from slimsfm.upkeep.repair import repair
-from wrong_poses import made_wrong
+from wrong_maps import made_wrong
 
 
 def rows(scene: Scene, shares: list[float], seeds: int) -> Iterator[list]:

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 
 from slimsfm.errors import MapError
@@ -56,6 +57,13 @@ def test_the_others_say_where_a_wrong_image_stands(right):
 def test_pictures_beside_wrong_ones_are_not_blamed(right):
     wrong = turned(turned(turned(right, "003.png", 60), "004.png", -50), "005.png", 40)
     assert check(wrong).wrong_names == ("003.png", "004.png", "005.png")
+
+
+def test_images_that_were_misplaced_together_are_found_together(right):
+    names = ["003.png", "004.png", "005.png", "006.png"]
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.0, 1.2])), np.zeros(3))
+    poses = {name: right.images[name].cam_from_world() * turn for name in names}
+    assert check(with_poses(right, poses)).wrong_names == tuple(names)
 
 
 def test_equal_maps_have_equal_findings(right):

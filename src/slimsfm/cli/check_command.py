@@ -88,7 +88,10 @@ def _marked(map: Map, found: MapCheck) -> Map:
 
 def _print(found: MapCheck, repaired: Repaired | None, output: Path | None, watch: Stopwatch) -> None:
     again = " (matched again: the map stores none)" if found.matches_from != "map" else ""
-    console.print(f"{plural(found.images, 'image')}, {plural(found.pairs, 'pair')} with matches{again}")
+    agree = f"{found.agreeing_pairs} of {plural(found.pairs, 'pair')} agree with the map"
+    console.print(f"{plural(found.images, 'image')}; {agree}{again}")
+    if 2 * found.agreeing_pairs < found.pairs:
+        console.print("warning: most pairs contradict the map: all of it may be wrong", style="bold red")
     console.print(
         f"the others localize an image {found.usual_error:.2g} d from its pose in the map (median), where "
         "d is the diagonal of the box"
@@ -121,6 +124,7 @@ def _facts(found: MapCheck, repaired: Repaired | None) -> dict[str, Any]:
     return {
         "images": found.images,
         "pairs": found.pairs,
+        "agreeing_pairs": found.agreeing_pairs,
         "matches_from": found.matches_from,
         "usual_error": found.usual_error,
         "wrong": [_wrong(one) for one in found.wrong],

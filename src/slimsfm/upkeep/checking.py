@@ -46,13 +46,14 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
     check_is_full(map)
     matches = matches_of(map, progress)
     witnesses = Witnesses(map, matches)
-    verdicts = Court(witnesses, map.box, progress).decide()
+    agreeing = agreement(map.images, matches)
+    verdicts = _decide(map, matches, agreeing, witnesses, progress)
     names, wrong = witnesses.names, _wrong_of(map, verdicts)
     neighbors = {name: [names[j] for j in witnesses.neighbors(i)] for i, name in enumerate(names)}
-    agreeing = agreement(map.images, matches)
     return MapCheck(
         images=len(names),
         pairs=len(agreeing),
+        agreeing_pairs=sum(share >= MIN_AGREEING for share in agreeing.values()),
         matches_from="map" if map.matches else "matched again",
         usual_error=_usual_error(verdicts),
         wrong=wrong,
@@ -66,8 +67,22 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
 
 def wrong_poses(map: Map, progress: ProgressBar = silent) -> tuple[WrongPose, ...]:
     """The images of a full map whose poses the others contradict: what benchmarks need of `check`."""
-    witnesses = Witnesses(map, matches_of(map, progress))
-    return _wrong_of(map, Court(witnesses, map.box, progress).decide())
+    matches = matches_of(map, progress)
+    agreeing = agreement(map.images, matches)
+    return _wrong_of(map, _decide(map, matches, agreeing, Witnesses(map, matches), progress))
+
+
+def _decide(
+    map: Map,
+    matches: Matches,
+    agreeing: Mapping[Pair, float],
+    witnesses: Witnesses,
+    progress: ProgressBar,
+) -> Verdicts:
+    """Decide which poses are wrong; parts that contradict the rest of the map are tried by the rest."""
+    threads = find_threads(witnesses.names, matches, agreeing, ())
+    parts = [one.part for one in threads if one.contradicted]
+    return Court(witnesses, map.box, progress).decide(parts)
 
 
 def check_is_full(map: Map) -> None:

@@ -194,6 +194,9 @@ class MapCheck:
     pairs: int
     """Number of pairs of images with matches."""
 
+    agreeing_pairs: int
+    """Number of these of which at least half of the matches agree with the map."""
+
     matches_from: Literal["map", "matched again"]
     """Source of the matches: stored in the map, or found again because the map stores none."""
 

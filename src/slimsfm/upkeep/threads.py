@@ -5,7 +5,7 @@ maximum spanning tree. A link of the tree is a thread if it is much weaker than 
 is, and if both sides have several images: no other pair across has more matches.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import networkx as nx
 import numpy as np
@@ -30,12 +30,7 @@ def find_threads(
         agreeing: Share of the matches of each pair that agree with the map.
         wrong: Images that are left out.
     """
-    graph = nx.Graph()
-    graph.add_nodes_from(name for name in sorted(names) if name not in wrong)
-    for (a, b), share in sorted(agreeing.items()):
-        count = round(share * len(matches[a, b]))
-        if share >= MIN_AGREEING and count and a in graph and b in graph:
-            graph.add_edge(a, b, count=count)
+    graph = _joined(sorted(set(names) - set(wrong)), matches, agreeing)
     best = [max((d["count"] for *_, d in graph.edges(name, data=True)), default=0) for name in graph]
     usual = int(np.median(best or [0]))
     tree = nx.maximum_spanning_tree(graph, weight="count")
@@ -46,23 +41,35 @@ def find_threads(
         sides = [nx.node_connected_component(tree, one) for one in (a, b)]
         tree.add_edge(a, b, count=count)
         smaller, larger = sorted(sides, key=lambda side: (len(side), min(side)))
-        if len(smaller) < _FEWEST:
-            continue
-        across = [
-            pair
-            for pair, share in sorted(agreeing.items())
-            if share < MIN_AGREEING
-            and len(matches[pair]) >= _STRONG
-            and ((pair[0] in smaller and pair[1] in larger) or (pair[1] in smaller and pair[0] in larger))
-        ]
-        found.append(
-            Thread(
-                part=tuple(sorted(smaller)),
-                rest=len(larger),
-                link=(a, b) if a in smaller else (b, a),
-                matches=count,
-                usual=usual,
-                contradicted=tuple(across),
+        if len(smaller) >= _FEWEST:
+            found.append(
+                Thread(
+                    part=tuple(sorted(smaller)),
+                    rest=len(larger),
+                    link=(a, b) if a in smaller else (b, a),
+                    matches=count,
+                    usual=usual,
+                    contradicted=tuple(_against(smaller, larger, matches, agreeing)),
+                )
             )
-        )
     return tuple(found)
+
+
+def _joined(names: list[str], matches: Matches, agreeing: Mapping[Pair, float]) -> nx.Graph:
+    """The images, joined by their matches that agree; what contradicts the map holds nothing together."""
+    graph = nx.Graph()
+    graph.add_nodes_from(names)
+    for (a, b), share in sorted(agreeing.items()):
+        if a in graph and b in graph:
+            graph.add_edge(a, b, count=round(share * len(matches[a, b])) if share >= MIN_AGREEING else 0)
+    return graph
+
+
+def _against(
+    part: Collection[str], rest: Collection[str], matches: Matches, agreeing: Mapping[Pair, float]
+) -> Iterator[Pair]:
+    """Pairs of an image of a part and one of the rest whose matches contradict the map."""
+    for (a, b), share in sorted(agreeing.items()):
+        is_across = (a in part and b in rest) or (b in part and a in rest)
+        if is_across and share < MIN_AGREEING and len(matches[a, b]) >= _STRONG:
+            yield a, b

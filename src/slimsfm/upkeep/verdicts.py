@@ -4,12 +4,13 @@ An image is tried by up to three disjoint sets of the other images. A set contra
 has if the pose it gives is far off, compared with what is predicted and with how far off poses of this map
 usually are, and if fewer than half of its matches also agree with the pose of the map.
 
+A part that hangs on the rest by contradicted pairs alone confirms itself, so it is tried by the rest first.
 Where one pose is wrong, right ones may be contradicted by it. So the worst images are taken out first, with
 all they contributed, and their neighbors are tried again. In the end each image that was taken out is tried
 by those that are left, and comes back if they confirm it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -80,13 +81,21 @@ class Court:
         self._usual = 1.0
         self._count = len(witnesses.names)
 
-    def decide(self) -> Verdicts:
-        """Find the wrong poses."""
+    def decide(self, parts: Sequence[Collection[str]] = ()) -> Verdicts:
+        """Find the wrong poses.
+
+        Args:
+            parts: Images that confirm each other but may be wrong together; the others try them first.
+        """
         numbers = range(self._count)
         sworn = [self._hear(i) for i in self._progress(numbers, "localize images from the others")]
         self._usual = _usual_ratio(sworn)
         trials = {i: self._judge(one) for i, one in zip(numbers, sworn, strict=True)}
         wrong: set[int] = set()
+        for part in parts:
+            wrong |= self._misplaced({i for i in numbers if self._witnesses.names[i] in part})
+        if wrong:
+            self._retry(trials, wrong, wrong)
         with counted(self._progress, self._count, "take out wrong poses") as advance_to:
             while worst := self._worst(trials, wrong):
                 wrong |= worst
@@ -103,6 +112,13 @@ class Court:
         return Verdicts(
             wrong=tuple(sorted(wrong)), trials=tuple(trials[i] for i in numbers), usual=self._usual
         )
+
+    def _misplaced(self, part: set[int]) -> set[int]:
+        """Those of a part whose poses all others contradict, if these are most of the ones they localize."""
+        self._witnesses.suspect(part)
+        tried = {i: self._judge(self._hear(i)) for i in sorted(part)}
+        against = {i for i, one in tried.items() if one.is_contradicted}
+        return against if 2 * len(against) > sum(bool(one.testimonies) for one in tried.values()) else set()
 
     def _retry(self, trials: dict[int, Trial], changed: set[int], wrong: set[int]) -> None:
         """Try those images again that have matches with images that were taken out or brought back."""
