@@ -24,6 +24,8 @@ def test_wrong_input_is_one_line(poster, tmp_path):
     assert "nowhere: no such video" in refusal(poster, "--film", tmp_path / "nowhere")
     assert "nowhere: no such file" in refusal(poster, "--cert", tmp_path / "nowhere", "--key", poster)
     assert "--cert" in refusal(poster, "--key", tmp_path / "nowhere")
+    assert "--model" in refusal(poster, "--anchor", tmp_path / "nowhere")
+    assert "nowhere.glb: no such model" in refusal(poster, "--model", tmp_path / "nowhere.glb", "--port", 0)
     assert "port must be between" in refusal(poster, "--port", 70000)
     assert "cannot be served" in refusal(poster, "--host", "no.such.host.invalid")
     with socket.create_server(("127.0.0.1", 0)) as taken:

@@ -1,17 +1,22 @@
 """The HTTP API: poses are the library's, wrong parameters are named, the document is complete."""
 
+import base64
 import re
+from dataclasses import replace
 
 import httpx
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from starlette.routing import Route
 
+from poster import poster_map
 from scenes import exact_map, like_sift
 from serving import encoded, photo, served
 from slimsfm.localization import Localizer, localize_images
 from slimsfm.localization.cameras import QueryCamera, guess_camera
+from slimsfm.mapping.georeference import Georeference
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.pose import Gravity
 from slimsfm.serve.app import ROUTES
@@ -187,6 +192,9 @@ def check(value, schema):
     if "enum" in schema:
         assert value in schema["enum"]
         return None
+    if "const" in schema:
+        assert value == schema["const"]
+        return None
     kinds = {"object": dict, "array": list, "string": str, "number": int | float, "integer": int}
     kinds |= {"boolean": bool, "null": type(None)}
     assert isinstance(value, kinds[schema["type"]]), (value, schema)
@@ -204,7 +212,7 @@ def check(value, schema):
 def test_metrics_are_prometheus_text(client):
     client.post("v1/localize", content=encoded(photo()))
     lines = client.get("metrics").text.splitlines()
-    assert all(re.fullmatch(r"#.*|slimsfm_\w+(\{[^{}]*\})? [0-9.e+-]+", line) for line in lines)
+    assert all(re.fullmatch(r"#.*|slimsfm_\w+(\{.*\})? [0-9.e+-]+", line) for line in lines)
     assert any(line.startswith('slimsfm_localizations_total{found="true",map="poster"} ') for line in lines)
     assert any(line.startswith("slimsfm_resident_memory_bytes ") for line in lines)
 
@@ -215,10 +223,67 @@ def test_unknown_paths_and_methods_are_errors_in_json(client):
     assert (answer.status_code, answer.json()["error"]["code"]) == (405, "method_not_allowed")
 
 
+def geopose_request(image, **changed):
+    reading = {"imageFormat": "PNG", "imageBytes": base64.b64encode(image).decode(), **changed}
+    return {"id": "mine", "type": "geopose", "sensors": [], "sensorReadings": {"cameraReadings": [reading]}}
+
+
+def test_a_map_on_the_earth_gives_poses_on_the_earth(tmp_path):
+    place = Georeference(latitude=48.2, longitude=16.37, height=171.0)
+    map_ = poster_map()
+    write_map(replace(map_, info=replace(map_.info, georeference=place)), tmp_path / "there")
+    params = {"model": "PINHOLE", "modelParams": [401, 401, 160, 120]}
+    with served(tmp_path / "there") as server, httpx.Client(base_url=server.url, timeout=20) as client:
+        assert client.get("v1/maps/there").json()["georeferenced"] is True
+        reply = client.post("v1/localize", content=encoded(photo())).json()
+        check(reply, schema_of("/v1/localize", "post"))
+        answer = client.post("oscp/localize/geopose", json=geopose_request(encoded(photo()))).json()
+        check(answer, schema_of("/oscp/localize/geopose", "post"))
+        given = client.post("oscp/localize/geopose", json=geopose_request(encoded(photo()), params=params))
+        nothing = client.post("oscp/localize/geopose", json=geopose_request(encoded(np.zeros_like(photo()))))
+    pose = reply["cam_from_world"]
+    rotation = pycolmap.Rotation3d(np.array(pose["quaternion_xyzw"]))
+    expected = place.geopose(pycolmap.Rigid3d(rotation, np.array(pose["translation"]))).to_json()
+    assert_close(reply["geopose"], expected)
+    assert answer["geopose"] == reply["geopose"]
+    assert (answer["id"], answer["type"]) == ("mine", "geopose")
+    assert answer["accuracy"]["position"] == reply["position_bound_95"]
+    assert given.status_code == 200
+    assert (nothing.status_code, nothing.json()["error"]["code"]) == (404, "not_found")
+
+
+def assert_close(one, other):
+    for part in ("position", "quaternion"):
+        assert one[part] == pytest.approx(other[part], abs=1e-9)
+
+
 def test_a_request_of_the_geopose_protocol_needs_a_map_on_the_earth(client):
-    body = {"sensorReadings": {"cameraReadings": [{"imageFormat": "JPG", "imageBytes": "aaaa"}]}}
-    answer = client.post("oscp/localize/geopose", json=body)
+    answer = client.post("oscp/localize/geopose", json=geopose_request(b"x"))
     assert (answer.status_code, answer.json()["error"]["code"]) == (404, "not_georeferenced")
-    for wrong in ({}, {"sensorReadings": {"cameraReadings": []}}, [1]):
+    for wrong in ({}, {"sensorReadings": {"cameraReadings": []}}, [1], geopose_request(b"x", imageBytes="?")):
         answer = client.post("oscp/localize/geopose", json=wrong)
         assert (answer.status_code, answer.json()["error"]["code"]) == (400, "bad_geopose_request")
+    raw = client.post("oscp/localize/geopose", json=geopose_request(b"x", imageFormat="RGBA32"))
+    assert raw.status_code == 415
+
+
+def test_the_model_is_given_for_the_first_map(poster, small, tmp_path):
+    trimesh.creation.box().export(tmp_path / "cube.glb")
+    (tmp_path / "anchor.json").write_text('{"scale": 2, "translation": [0, 0, 1]}')
+    files = {"model": tmp_path / "cube.glb", "anchor": tmp_path / "anchor.json"}
+    with served(poster, small, **files) as server, httpx.Client(base_url=server.url) as client:
+        model = client.get("v1/maps/poster/model").json()
+        check(model, schema_of("/v1/maps/{id}/model", "get"))
+        other = client.get("v1/maps/small-poster/model")
+    corners = np.reshape(model["positions"], (-1, 3))
+    assert np.allclose([corners.min(axis=0), corners.max(axis=0)], [[-1, -1, 0], [1, 1, 2]])
+    assert (other.status_code, other.json()["error"]["code"]) == (404, "no_model")
+
+
+def test_a_film_is_given_whole_and_in_parts(poster, tmp_path):
+    (tmp_path / "film.webm").write_bytes(bytes(range(200)))
+    with served(poster, film=tmp_path / "film.webm") as server, httpx.Client(base_url=server.url) as client:
+        assert client.get("v1/maps").json()["film"] is True
+        whole, part = client.get("v1/film"), client.get("v1/film", headers={"Range": "bytes=10-19"})
+    assert (whole.content, whole.headers["content-type"]) == (bytes(range(200)), "video/webm")
+    assert (part.status_code, part.content) == (206, bytes(range(10, 20)))

@@ -22,6 +22,7 @@ ROUTES: tuple[BaseRoute, ...] = (
     Route("/v1/maps", handlers.list_maps),
     Route("/v1/maps/{id}", handlers.show_map),
     Route("/v1/maps/{id}/points", handlers.show_points),
+    Route("/v1/maps/{id}/model", handlers.show_model),
     Route("/v1/film", handlers.show_film),
     Route("/authority.crt", handlers.show_authority),
     Route("/openapi.json", handlers.show_api),

@@ -22,14 +22,10 @@ from slimsfm.serve.queries import CameraChoice, Intrinsics, intrinsics_of
 Json = dict[str, Any]
 
 
-def is_georeferenced(map: Map) -> bool:  # noqa: ARG001
-    """Whether it is known where on the earth a map is. No map says so yet."""
-    return False
-
-
-def geopose_of(map: Map, cam_from_world: pycolmap.Rigid3d) -> Json | None:  # noqa: ARG001
-    """The pose of a camera on the earth, OGC's basic quaternion form; None if the map is not on the earth."""
-    return None
+def geopose_of(map: Map, cam_from_world: pycolmap.Rigid3d) -> Json | None:
+    """The pose of a camera on the earth [2], as in `poses.json`; None if the map is not on the earth."""
+    place = map.info.georeference
+    return None if place is None else place.geopose(cam_from_world).to_json()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,16 +78,15 @@ def geopose_response(request: GeoPoseRequest, reply: Json) -> Json:
     """The answer of the protocol to a localization.
 
     Raises:
-        ApiError: The object was not found, or its map is not on the earth (404).
+        ApiError: The object was not found (404).
     """
     if not reply["found"]:
         raise ApiError(404, "not_found", f"the camera was not localized: {reply['reason']}")
-    if reply["geopose"] is None:
-        raise ApiError(404, "not_georeferenced", "the map does not say where on the earth it is")
+    accuracy = {"position": reply["position_bound_95"], "orientation": reply["rotation_bound_95_deg"]}
     return {
         "id": request.id,
         "timestamp": int(1000 * time.time()),
         "type": "geopose",
-        "accuracy": {"position": reply["predicted_error"], "orientation": reply["rotation_error_deg"]},
+        "accuracy": accuracy,
         "geopose": reply["geopose"],
     }

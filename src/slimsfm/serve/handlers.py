@@ -9,7 +9,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 
 from slimsfm.serve.bodies import read_body
 from slimsfm.serve.errors import ApiError, bad_request
-from slimsfm.serve.geopose import geopose_response, is_georeferenced, parse_geopose_request
+from slimsfm.serve.geopose import geopose_response, parse_geopose_request
 from slimsfm.serve.localizing import localize_bytes
 from slimsfm.serve.openapi import OPENAPI
 from slimsfm.serve.queries import LocalizeQuery, query_of
@@ -59,7 +59,7 @@ async def localize_geopose(request: Request) -> Response:
     service = service_of(request)
     service.rate.take(client_of(request))
     asked = parse_geopose_request(await read_body(request, service.options.limits))
-    maps = [one for one in service.store.select(()) if is_georeferenced(one.localizer.map)]
+    maps = [one for one in service.store.select(()) if one.localizer.map.info.georeference]
     if not maps:
         raise ApiError(404, "not_georeferenced", "no map says where on the earth it is")
 
@@ -106,6 +106,14 @@ async def show_points(request: Request) -> Response:
     """`GET /v1/maps/{id}/points`."""
     served = service_of(request).store[request.path_params["id"]]
     return JSONResponse(await asyncio.to_thread(points_reply, served))
+
+
+async def show_model(request: Request) -> Response:
+    """`GET /v1/maps/{id}/model`: what the page draws in the place of an object."""
+    served = service_of(request).store[request.path_params["id"]]
+    if served.model is None:
+        raise ApiError(404, "no_model", "the map has no model; --model gives it one")
+    return Response(served.model, media_type="application/json")
 
 
 async def show_film(request: Request) -> Response:

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from slimsfm.files import read_bytes
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import QueryCamera, guess_camera
 from slimsfm.mapping.io import read_map
+from slimsfm.mapping.map import Map
 from slimsfm.serve.errors import ApiError
 
 _LOGGER = logging.getLogger(__name__)
@@ -34,19 +35,32 @@ class ServedMap:
     localizer: Localizer
     """Localizer of the map."""
 
+    model: bytes | None = None
+    """What the page draws at the object, as JSON."""
+
 
 class MapStore:
     """The maps that are served, by id. Reading is safe from any thread; `reload_changed` is for one."""
 
-    def __init__(self, paths: Sequence[Path], options: LocalizationOptions) -> None:
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        options: LocalizationOptions,
+        model_for: Callable[[str, Map], bytes | None] = lambda _id, _map: None,
+    ) -> None:
         """Read the maps.
+
+        Args:
+            paths: Their folders.
+            options: How images are localized.
+            model_for: Gives the model of a map, by its id, as JSON.
 
         Raises:
             InputError: There is none, one is given twice, or one cannot be read.
         """
         if not paths:
             raise InputError("maps: give at least one map to serve")
-        self._options = options
+        self._options, self._model_for = options, model_for
         self._paths = dict(zip(map_ids(paths), paths, strict=True))
         self._states = {key: _state(path) for key, path in self._paths.items()}
         self._served = {key: self._read(key) for key in self._paths}
@@ -104,7 +118,9 @@ class MapStore:
         digest = hashlib.sha256(read_bytes(path / _INFO) + found.fingerprint.encode())
         localizer = Localizer(found, self._options)
         _warm_up(localizer)
-        return ServedMap(id=id, version=digest.hexdigest()[:12], localizer=localizer)
+        return ServedMap(
+            id=id, version=digest.hexdigest()[:12], localizer=localizer, model=self._model_for(id, found)
+        )
 
 
 def map_ids(paths: Sequence[Path]) -> list[str]:

@@ -52,6 +52,8 @@ _LOCALIZATION = {
     "inliers": _COUNT,
     "predicted_error": _or_null({**_NUMBER, "description": "Mean error of the box's corners, in the unit."}),
     "predicted_corner_error": _or_null({**_NUMBER, "description": "The same over the box's diagonal."}),
+    "position_bound_95": _or_null({**_NUMBER, "description": "Holds with 95 % probability, in the unit."}),
+    "rotation_bound_95_deg": _or_null({**_NUMBER, "description": "Holds with 95 % probability."}),
     "camera": _reference("Camera"),
     "camera_source": {"enum": ["given", "map", "queries", "exif", "unknown"]},
     "camera_estimated": _array({"type": "string"}),
@@ -100,6 +102,13 @@ _SCHEMAS: Json = {
             "count": _COUNT,
             "positions": _array(_array(_NUMBER, 3)),
             "colors": _array(_array(_COUNT, 3)),
+        }
+    ),
+    "Model": _object(
+        {
+            **dict.fromkeys(("positions", "normals", "uvs", "colors"), _array(_NUMBER)),
+            "indices": _array(_COUNT),
+            "texture": _or_null(_text("A data URI.")),
         }
     ),
     "MapResult": _object(_LOCALIZATION),
@@ -193,6 +202,11 @@ _PATHS: Json = {
     "/v1/maps/{id}": {"get": _operation("One map.", _answer("Map"), (401, 404), parameters=[_ID])},
     "/v1/maps/{id}/points": {
         "get": _operation("Points of a map, 5000 at most.", _answer("Points"), (401, 404), parameters=[_ID])
+    },
+    "/v1/maps/{id}/model": {
+        "get": _operation(
+            "The triangle mesh that the page draws.", _answer("Model"), (401, 404), parameters=[_ID]
+        )
     },
     "/v1/film": {"get": _operation("The film to play instead of a camera.", _FILE, (401, 404))},
     "/v1/localize": {

@@ -71,6 +71,12 @@ class ServeOptions:
     record: Path | None = None
     """Folder that images and their poses are written to. None: images are neither kept nor logged."""
 
+    model: Path | None = None
+    """GLB, OBJ or PLY that the page draws at the first map's object."""
+
+    anchor: Path | None = None
+    """Where the model is in the map, see `models.read_anchor`. None: in the center of the box, as large."""
+
     film: Path | None = None
     """Video that the page can play instead of a camera."""
 
@@ -85,3 +91,7 @@ class ServeOptions:
 
     limits: ServeLimits = field(default_factory=ServeLimits)
     """How much is taken on."""
+
+    def __post_init__(self) -> None:
+        if self.anchor and not self.model:
+            raise ValueError("anchor goes with a model; give `model` too")

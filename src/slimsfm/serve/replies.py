@@ -7,7 +7,7 @@ import pycolmap
 
 from slimsfm.localization import Localization
 from slimsfm.mapping.map import Map
-from slimsfm.serve.geopose import geopose_of, is_georeferenced
+from slimsfm.serve.geopose import geopose_of
 from slimsfm.serve.maps import ServedMap
 
 Json = dict[str, Any]
@@ -31,7 +31,7 @@ def map_reply(served: ServedMap) -> Json:
         "num_images": len(map_.images),
         "orientation": map_.info.orientation,
         "camera": None if camera is None else camera_reply(camera),
-        "georeferenced": is_georeferenced(map_),
+        "georeferenced": map_.info.georeference is not None,
     }
 
 
@@ -93,6 +93,8 @@ def localization_reply(served: ServedMap, found: Localization) -> Json:
         "inliers": pose.num_inliers if pose else 0,
         "predicted_error": None if relative is None else relative * float(map_.box.diagonal),
         "predicted_corner_error": relative,
+        "position_bound_95": pose and pose.position_bound,
+        "rotation_bound_95_deg": pose and pose.rotation_bound_deg,
         "camera": camera_reply(found.camera),
         "camera_source": found.camera_source,
         "camera_estimated": list(found.camera_estimated),

@@ -1,12 +1,15 @@
 """What the handlers of a server share."""
 
 import asyncio
+import json
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
-from slimsfm.serve.maps import MapStore
+from slimsfm.mapping.map import Map
+from slimsfm.serve.maps import MapStore, map_ids
 from slimsfm.serve.metrics import Metrics, resident_bytes
+from slimsfm.serve.models import read_anchor, read_model
 from slimsfm.serve.options import ServeOptions
 from slimsfm.serve.pool import FairPool
 from slimsfm.serve.rate import RateLimiter
@@ -37,7 +40,7 @@ class Service:
         """
         limits = options.limits
         self.options = options
-        self.store = MapStore(options.maps, options.localization)
+        self.store = MapStore(options.maps, options.localization, _models(options))
         self.recorder = Recorder(options.record)
         self.pool = FairPool(limits.workers, limits.max_waiting)
         self.sessions = Sessions(limits.max_sessions, limits.sessions_per_client)
@@ -74,3 +77,16 @@ class Service:
             map_loads_total=self.store.loads,
             resident_memory_bytes=resident_bytes(),
         )
+
+
+def _models(options: ServeOptions) -> Callable[[str, Map], bytes | None]:
+    """What gives the model of a map; the first map alone has one."""
+    if options.model is None:
+        return lambda _id, _map: None
+    path, anchor = options.model, read_anchor(options.anchor) if options.anchor else None
+    first = map_ids(options.maps)[0]
+
+    def model_for(map_id: str, map: Map) -> bytes | None:
+        return json.dumps(read_model(path, map.box, anchor).to_json()).encode() if map_id == first else None
+
+    return model_for

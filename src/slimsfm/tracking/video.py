@@ -22,11 +22,12 @@ from slimsfm.photos import Orientation, read_image
 from slimsfm.skipping import SkippedPhotos
 from slimsfm.tracking.film import film_pictures, open_film, pyav
 
-VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska"}
+VIDEO_FORMATS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}
 """Container formats of the videos that can be written, by suffix."""
 
 _DEFAULT_RATE = 30.0  # frames per second, where the source does not say
-_QUALITY = {"crf": "20", "preset": "veryfast"}
+_H264 = "libx264", {"crf": "20", "preset": "veryfast"}
+_VP8 = "libvpx", {"crf": "10", "b": "4M", "deadline": "realtime", "cpu-used": "4"}  # which all browsers play
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,7 +184,9 @@ def check_format(path: str | Path) -> None:
 def write_video(
     path: str | Path, frames_per_second: float, *, overwrite: bool = False
 ) -> Iterator[Callable[[Image], None]]:
-    """Write RGB images of one size as a video (H.264): yields a function to call with each image in turn.
+    """Write RGB images of one size as a video: yields a function to call with each image in turn.
+
+    The film is H.264, in .webm VP8.
 
     Raises:
         OutputError: The suffix is not that of a format that can be written, or the file cannot be written.
@@ -196,14 +199,15 @@ def write_video(
         pyav().open(str(partial), "w", format=VIDEO_FORMATS[path.suffix]) as container,
     ):
         stream = None
+        codec, quality = _VP8 if path.suffix == ".webm" else _H264
 
         def write(image: Image) -> None:
             nonlocal stream
             even = np.pad(image, [(0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)], "edge")
             if stream is None:
-                stream = container.add_stream("libx264", Fraction(frames_per_second).limit_denominator(1001))
+                stream = container.add_stream(codec, Fraction(frames_per_second).limit_denominator(1001))
                 stream.height, stream.width = even.shape[:2]
-                stream.pix_fmt, stream.options = "yuv420p", _QUALITY
+                stream.pix_fmt, stream.options = "yuv420p", dict(quality)
             frame = pyav().VideoFrame.from_ndarray(even, format="rgb24")
             container.mux(stream.encode(frame))
 
