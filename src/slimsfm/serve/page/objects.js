@@ -14,8 +14,8 @@ export const COLORS = {
   rim: /** @type {[number, number, number]} */ ([0.02, 0.03, 0.04]),
 };
 const AXES = /** @type {[number, number, number][]} */ ([[1, 0.3, 0.33], [0.35, 0.9, 0.35], [0.35, 0.6, 1]]);
-const POINT_SHARE = 1 / 160; // width of a point over that of the picture
-const LINE_SHARE = 1 / 200;
+const POINT_SHARE = 1 / 240; // width of a point over that of the picture
+const LINE_SHARE = 1 / 240;
 
 /** An object on the GPU. */
 export class DrawnObject {

@@ -164,7 +164,7 @@ export class Painter {
   }
 
   /** @param {Shape} shape @param {Eye} eye @param {{width: number, opacity?: number, core?: number}} style Width in pixels; share of it within the dark rim. */
-  drawPoints(shape, eye, { width, opacity = 1, core = 0.62 }) {
+  drawPoints(shape, eye, { width, opacity = 1, core = 0.72 }) {
     const { gl } = this;
     const { uniforms } = this.begin("points", eye, { blend: true, deep: false });
     gl.uniform1f(uniforms.get("width"), width);
