@@ -33,9 +33,9 @@ from slimsfm.synthetic.scene import Take, mapping_take, textured_object
 from slimsfm.upkeep.align import Positions, Tag, align
 from slimsfm.upkeep.positions import KnownPositions
 
-OBJECT, FRAMES, WIDTH, HEIGHT, SEED = "boulder", 36, 640, 480, 0
+OBJECT, FRAMES, WIDTH, HEIGHT, SEED = "boulder", 30, 640, 480, 0
 TAG, TAG_SIDE, MARGIN = 7, 0.12, 0.125  # number, side in meters, and margin over the side
-TAG_PLACE = (0.0, -0.28)
+ASIDE = (0.24, 0.0, 0.0)  # where the object stands, so that the tag is in the center
 RADIUS, NOISE, DRAWS = 40.0, 5.0, 100  # meters, meters, repetitions
 ORIGIN = np.array([55.7058, 13.1932, 50.0])
 FIRST = 20
@@ -100,7 +100,7 @@ def tagged_take() -> Take:
     sheet = np.pad(tag, round(MARGIN * pixels), constant_values=255)
     rgb = np.repeat((sheet // 2 + 50)[..., None], 3, axis=2).astype(np.uint8)
     lying = shapes.ground(TAG_SIDE * (1 + 2 * MARGIN), rgb, shapes.lowest(mesh) + 1e-3)
-    lying.apply_translation([*TAG_PLACE, 0.0])
+    mesh.apply_translation(ASIDE)
     cloth = texture.page(np.random.default_rng(take.seed), 2000, 2000, cell=150) // 4 + 110
     table = shapes.ground(2.4, cloth, shapes.lowest(mesh))
     return Take(

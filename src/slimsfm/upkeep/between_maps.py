@@ -4,7 +4,6 @@ A pair of poses of one image tells more than two positions: each fixes the rotat
 suffice, and two that stand apart fix the scale.
 """
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -124,15 +123,7 @@ def localized_poses(target: Map, source: Map, *, progress: ProgressBar = silent)
             "finds no keypoints; build both with an extractor that does"
         )
     if source.features:
-        found = _localized(target, source, progress)
-        names = tuple(found)
-        return PosePairs(
-            names=names,
-            cam_from_target=tuple(found.values()),
-            cam_from_source=tuple(source.images[name].cam_from_world() for name in names),
-            how="localized images",
-            tried=min(len(source.images), _MOST_IMAGES),
-        )
+        return _localized(target, source, progress)
     if not target.features:
         raise InputError(
             "the maps share no images, and neither holds features of its images; use the full map that one "
@@ -148,7 +139,7 @@ def localized_poses(target: Map, source: Map, *, progress: ProgressBar = silent)
     )
 
 
-def _localized(target: Map, source: Map, progress: ProgressBar) -> Mapping[str, pycolmap.Rigid3d]:
+def _localized(target: Map, source: Map, progress: ProgressBar) -> PosePairs:
     names, localizer = list(source.images), Localizer(target)
     chosen = [names[row] for row in evenly_spaced(len(names), _MOST_IMAGES)]
     found = {}
@@ -156,7 +147,13 @@ def _localized(target: Map, source: Map, progress: ProgressBar) -> Mapping[str, 
         pose = localizer.localize_features(source.features[name], source.camera(name)).pose
         if pose is not None:
             found[name] = pose.cam_from_world
-    return found
+    return PosePairs(
+        names=tuple(found),
+        cam_from_target=tuple(found.values()),
+        cam_from_source=tuple(source.images[name].cam_from_world() for name in found),
+        how="localized images",
+        tried=len(chosen),
+    )
 
 
 def similarity_from_poses(pairs: PosePairs, *, seed: int = 0) -> MapSimilarity:

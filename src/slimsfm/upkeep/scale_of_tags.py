@@ -44,7 +44,7 @@ def scale_of_tags(map: Map, views: dict[int, list[TagView]], side: float, number
         InputError: The tag is not there, no tag is determined, or two give different scales.
     """
     if number is not None and number not in views:
-        found = ", ".join(map_str(views))
+        found = ", ".join(str(one) for one in views)
         raise InputError(f"the photos do not show tag {number}, but {found}; name one of these")
     chosen = views if number is None else {number: views[number]}
     tags, failures = [], []
@@ -65,11 +65,6 @@ def scale_of_tags(map: Map, views: dict[int, list[TagView]], side: float, number
         tags=tuple(tags),
         notes=tuple(f"left out: {failure}" for failure in failures),
     )
-
-
-def map_str(views: dict[int, list[TagView]]) -> list[str]:
-    """The numbers of tags as text."""
-    return [str(number) for number in views]
 
 
 def _check_equal(tags: list[TagSize], side: float) -> None:
