@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from PIL import Image
 
 pytest.importorskip("websocket", reason="browsing needs websocket-client: pip install websocket-client")
@@ -29,8 +30,10 @@ from page_film import (
 )
 from page_overlap import FLAGS
 from poster import poster_camera, poster_map, poster_photo, poster_pose
+from serving import served
 from slimsfm.execution import num_cores
 from slimsfm.geometry import project
+from slimsfm.tracking.video import write_video
 
 FRAMES, FRAMES_PER_SECOND, AWAY = 40, 10, range(24, 36)
 SOON_S = 0.5
@@ -153,6 +156,34 @@ def test_the_camera_stops_while_the_page_is_hidden(opened):
     assert page.run("tracks.map((track) => track.readyState)") == ["ended"]
     page.run(hide.format("false"))
     page.wait_for(f"{STATE} === 'found'")
+
+
+def test_the_film_of_the_server_is_played_and_its_model_drawn(opened, film, poster):
+    pytest.importorskip("av", reason="writing videos needs PyAV: pip install 'slimsfm[video]'")
+    folder = opened.folder
+    cube = trimesh.creation.box((1, 1, 1))
+    cube.visual.vertex_colors = [255, 0, 255, 255]
+    cube.export(folder / "cube.ply")
+    with write_video(folder / "film.webm", float(FRAMES_PER_SECOND)) as write:
+        for frame in film.frames[: AWAY.start]:
+            write(frame)
+    with served(poster, model=folder / "cube.ply", film=folder / "film.webm") as other:
+        opened.page.open(f"{other.url}?film")
+        opened.page.wait_for(f"{STATE} === 'found'", 60)
+        opened.page.wait_for(f"({MAGENTA_SHARE})() > 0.01", 60)
+        assert opened.page.complaints() == []
+
+
+MAGENTA_SHARE = """() => {
+  const [view, copy] = [document.getElementById("view"), document.createElement("canvas")];
+  [copy.width, copy.height] = [90, 90];
+  const context = copy.getContext("2d");
+  context.drawImage(view, 0, 0, 90, 90);
+  const { data } = context.getImageData(0, 0, 90, 90);
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4) count += data[i] > 90 && data[i + 1] < 30 && data[i + 2] > 90;
+  return count / 8100;
+}"""
 
 
 def choose(page: Page, path: Path) -> None:

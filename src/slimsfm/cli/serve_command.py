@@ -101,7 +101,7 @@ def check_can_serve() -> None:
 
 
 def serve_until_stopped(options: "ServeOptions", binding: "Binding", *, opens_page: bool = False) -> None:
-    """Serve until Ctrl-C or SIGTERM, and print where; open the page in the browser if asked."""
+    """Serve until Ctrl-C or SIGTERM, and print where; if asked, open the page, which plays the film at once."""
     from slimsfm.serve.announcing import announcement
     from slimsfm.serve.running import MapServer, silence_uvicorn
 
@@ -111,7 +111,9 @@ def serve_until_stopped(options: "ServeOptions", binding: "Binding", *, opens_pa
     def announce() -> None:
         console.print(announcement(server), highlight=False, markup=False, soft_wrap=True)
         if opens_page:
-            Thread(target=webbrowser.open, args=(server.urls[0],), daemon=True).start()
+            address, mark, token = server.urls[0].partition("#")
+            playing = f"{address}?film{mark}{token}"
+            Thread(target=webbrowser.open, args=(playing,), daemon=True).start()
 
     with suppress(KeyboardInterrupt):
         server.run(announce)

@@ -73,6 +73,7 @@ _MAP = _object(
         "orientation": {"enum": ["upright", "stored"]},
         "camera": _or_null(_reference("Camera")),
         "georeferenced": _FLAG,
+        "model": _FLAG,
     }
 )
 

@@ -32,6 +32,7 @@ def map_reply(served: ServedMap) -> Json:
         "orientation": map_.info.orientation,
         "camera": None if camera is None else camera_reply(camera),
         "georeferenced": map_.info.georeference is not None,
+        "model": served.model is not None,
     }
 
 

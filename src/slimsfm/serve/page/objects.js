@@ -15,7 +15,7 @@ export const COLORS = {
 };
 const AXES = /** @type {[number, number, number][]} */ ([[1, 0.3, 0.33], [0.35, 0.9, 0.35], [0.35, 0.6, 1]]);
 const POINT_SHARE = 1 / 240; // width of a point over that of the picture
-const LINE_SHARE = 1 / 240;
+const LINE_SHARE = 1 / 200;
 
 /** An object on the GPU. */
 export class DrawnObject {
@@ -83,7 +83,7 @@ export class DrawnObject {
 
   get lineWidth() {
     const { width, height } = this.painter.part;
-    return Math.max(2, LINE_SHARE * Math.hypot(width, height));
+    return Math.max(2.5, LINE_SHARE * Math.hypot(width, height));
   }
 
   /** @param {Shape} lines @param {Eye} eye @param {[number, number, number] | undefined} paint @param {boolean} deep */
