@@ -151,7 +151,9 @@ def measure(address: str, film: NumberedFilm, file: Path, options: argparse.Name
         overlaps = list(measured(film, page, options))
         record = page.run("record")
         hosts = {one.split("/")[2] for one in page.requests() if one.startswith(("http", "ws"))}
-        figures = page.run("document.getElementById('figures').textContent")
+        figures = page.run(
+            "document.getElementById('figures').textContent + ', ' + document.getElementById('figures').title"
+        )
         report(overlaps, returns(film, record), figures, hosts, page.complaints())
 
 

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from slimsfm.upkeep.checking import check
     from slimsfm.upkeep.findings import MapCheck
     from slimsfm.upkeep.forget import ForgetOptions, Forgetting, forget
+    from slimsfm.upkeep.merge import Merged, merge
     from slimsfm.upkeep.positions import read_positions
     from slimsfm.upkeep.repair import Repaired, repair
     from slimsfm.upkeep.transform import transformed
@@ -82,6 +83,7 @@ _MODULES = {
     "Localizer": "slimsfm.localization",
     "Map": "slimsfm.mapping",
     "MapCheck": "slimsfm.upkeep.findings",
+    "Merged": "slimsfm.upkeep.merge",
     "MultiLocalizer": "slimsfm.localization",
     "OtherMap": "slimsfm.upkeep.align",
     "PoseEstimate": "slimsfm.pose",
@@ -105,6 +107,7 @@ _MODULES = {
     "import_colmap": "slimsfm.mapping",
     "localize_images": "slimsfm.localization",
     "localize_objects": "slimsfm.localization",
+    "merge": "slimsfm.upkeep.merge",
     "read_image": "slimsfm.photos",
     "read_map": "slimsfm.mapping",
     "read_positions": "slimsfm.upkeep.positions",
@@ -140,6 +143,7 @@ __all__ = [
     "Localizer",
     "Map",
     "MapCheck",
+    "Merged",
     "MultiLocalizer",
     "OtherMap",
     "PoseEstimate",
@@ -163,6 +167,7 @@ __all__ = [
     "import_colmap",
     "localize_images",
     "localize_objects",
+    "merge",
     "read_image",
     "read_map",
     "read_positions",

@@ -34,15 +34,17 @@ NEW = (5, 11)
 
 @pytest.fixture(scope="session")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as the how-to guides need it: `photos/`, `new/` and `video.mp4` of a rendered object."""
+    """A folder as the how-to guides need it: `photos/`, `photos-2/`, `new/` and `video.mp4` of a rendered object."""
     pytest.importorskip("av", reason="needs PyAV, which is not installed")
     folder = tmp_path_factory.mktemp("filmed")
     take = mapping_take("printed_box", FILM, 320, 240, seed=0)
     frames = [take.frame(index) for index in range(FRAMES)]
-    for name in ("photos", "new"):
+    for name in ("photos", "new", "photos-2"):
         (folder / name).mkdir()
     for index in range(0, FRAMES, 2):
         Image.fromarray(frames[index]).save(folder / "photos" / f"{index:02d}.png")
+    for index in range(6, FRAMES):
+        Image.fromarray(frames[index]).save(folder / "photos-2" / f"{index:02d}.png")
     for index in NEW:
         Image.fromarray(frames[index]).save(folder / "new" / f"{index:02d}.png")
     with write_video(folder / "video.mp4", FRAMES_PER_SECOND) as write:

@@ -53,6 +53,7 @@ COMMANDS = {
     "import": Entry("import_command:import_", "make a map from a COLMAP model or hloc output"),
     "reduce": Entry("reduce_command:reduce", "keep only what localization needs, and predict the loss"),
     "add": Entry("add_command:add_photos", "add photos to a map, without moving what it has"),
+    "merge": Entry("merge_command:merge_maps", "join two maps of one place"),
     "forget": Entry("forget_command:forget_of", "drop what a map no longer needs, and say what that costs"),
     "localize": Entry("localize_command:localize", "estimate the camera poses of new images"),
     "track": Entry("track_command:track", "estimate the camera pose of every frame of a video"),

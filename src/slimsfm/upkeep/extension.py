@@ -84,7 +84,7 @@ def extend_map(
     if taken := {image.camera_id for image in map.images.values()}.intersection(refined_cameras):
         raise ValueError(f"refined_cameras must be of new images alone, but {min(taken)} is not")
     model = pycolmap.Reconstruction(map.model)
-    _add_images(model, new)
+    add_images(model, new)
     work = shrunk_model(model, map.info.extractor_options)
     near = {name for pair in matches for name in pair}
     old_matches = {pair: map.matches[pair] for pair in map.matches if near.issuperset(pair)}
@@ -115,7 +115,8 @@ def _check(map: Map, new: Mapping[str, NewImage], matches: Matches) -> None:
             raise ValueError(f"matches must be of a new image each, in order of names, got {a!r} and {b!r}")
 
 
-def _add_images(model: pycolmap.Reconstruction, new: Mapping[str, NewImage]) -> None:
+def add_images(model: pycolmap.Reconstruction, new: Mapping[str, NewImage]) -> None:
+    """Add images with keypoints that observe nothing to a model, in order of names."""
     following = count(1 + max(model.images))
     frames = count(1 + max(model.frames))
     for name in sorted(new):
