@@ -34,7 +34,7 @@ NEW = (5, 11)
 
 @pytest.fixture(scope="session")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as the how-to guides need it: `photos/`, `photos-2/`, `new/` and `video.mp4` of a rendered object."""
+    """Folders and a video of a rendered object, as the how-to guides need them."""
     pytest.importorskip("av", reason="needs PyAV, which is not installed")
     folder = tmp_path_factory.mktemp("filmed")
     take = mapping_take("printed_box", FILM, 320, 240, seed=0)
