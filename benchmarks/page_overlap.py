@@ -142,7 +142,7 @@ def measure(address: str, film: NumberedFilm, file: Path, options: argparse.Name
     with tempfile.TemporaryDirectory() as profile, open_page("about:blank", Path(profile), flags) as page:
         page.prepare(KEEP_PIXELS)
         page.open(address)
-        page.resize(720, 640)
+        page.resize(400, 460)
         page.wait_for("document.body.dataset.state === 'idle'")
         page.run("document.getElementById('show-model').click()")
         page.click("#start")
@@ -151,7 +151,9 @@ def measure(address: str, film: NumberedFilm, file: Path, options: argparse.Name
         overlaps = list(measured(film, page, options))
         record = page.run("record")
         hosts = {one.split("/")[2] for one in page.requests() if one.startswith(("http", "ws"))}
-        figures = page.run("document.getElementById('figures').textContent")
+        figures = page.run(
+            "document.getElementById('figures').textContent + ', ' + document.getElementById('figures').title"
+        )
         report(overlaps, returns(film, record), figures, hosts, page.complaints())
 
 

@@ -135,7 +135,7 @@ export class Live {
     const { viewer, video, preview } = this.parts;
     const { known } = this;
     const how = known ? manner(this.hasGyroscope, captured - known.captured) : "alone";
-    if (how === "held") return;
+    if (how === "held" || viewer.painter.busy) return;
     const overlay = known && how === "carried" ? { ...known, pose: this.carried(known, captured) } : null;
     viewer.show(video, this.size, overlay, this.state === "searching" || this.state === "lost" ? preview() : null);
     if (known && how === "alone") this.waitFor(known);

@@ -52,6 +52,8 @@ export class Painter {
     };
     this.quad = this.shape({ corner: { data: QUAD, size: 2 } }, 4);
     this.picture = this.texture();
+    /** @type {WebGLSync | null} */
+    this.fence = null;
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
@@ -111,6 +113,20 @@ export class Painter {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, source);
     gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, false);
     if (shrunk) gl.generateMipmap(gl.TEXTURE_2D);
+  }
+
+  /** Remember the work until now, see `busy`. */
+  mark() {
+    const { gl } = this;
+    if (this.fence) gl.deleteSync(this.fence);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+
+  /** Whether the GPU still works on what was marked: more work would only queue up behind it. */
+  get busy() {
+    const { gl, fence } = this;
+    return Boolean(fence) && gl.getSyncParameter(/** @type {WebGLSync} */ (fence), gl.SYNC_STATUS) !== gl.SIGNALED;
   }
 
   /** Show a picture in a part of the canvas; the rest is black. @param {TexImageSource} source @param {Rectangle} part */

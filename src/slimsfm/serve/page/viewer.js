@@ -53,6 +53,7 @@ export class Viewer {
     this.overlay = overlay;
     this.painter.show(source, this.part());
     this.drawOver(preview);
+    this.painter.mark();
   }
 
   /** Draw the last picture again, with other options or in another size. */
