@@ -103,9 +103,10 @@ def check_can_serve() -> None:
 def serve_until_stopped(options: "ServeOptions", binding: "Binding", *, opens_page: bool = False) -> None:
     """Serve until Ctrl-C or SIGTERM, and print where; if asked, open the page and play the film."""
     from slimsfm.serve.announcing import announcement
-    from slimsfm.serve.running import MapServer, silence_uvicorn
+    from slimsfm.serve.running import MapServer, silence_uvicorn, use_few_arenas
 
     silence_uvicorn()
+    use_few_arenas()
     server = MapServer(options, binding)
 
     def announce() -> None:
