@@ -11,6 +11,7 @@ from slimsfm.cli.options import Advanced, Argument
 from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.localization import LocalizationOptions
+from slimsfm.serve.options import LIVE_TRACKING
 from slimsfm.tracking import TrackerOptions
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def serve(
     origins: tuple[str, ...] = (),
     workers: int | None = None,
     localization: Annotated[LocalizationOptions, Advanced()] = LocalizationOptions(),
-    tracker: Annotated[TrackerOptions, Advanced()] = TrackerOptions(),
+    tracker: Annotated[TrackerOptions, Advanced()] = LIVE_TRACKING,
     networks: Annotated[Networks, Advanced()] = Networks(),
     reading: Annotated[Reading, Advanced()] = Reading(),
 ) -> None:
