@@ -101,7 +101,12 @@ def drawn_outline(picture: Image) -> Points2D | None:
     """The hull of the pixels that have the color of the page's box; None where there are hardly any."""
     away = np.linalg.norm(picture.astype(float) - BOX_COLOR, axis=2)
     is_box = cv2.morphologyEx((away < _SIMILAR).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    y, x = np.nonzero(is_box)
+    joined = cv2.dilate(is_box, np.ones((7, 7), np.uint8))  # over what hides an edge
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
+    if len(stats) < 2:
+        return None
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    y, x = np.nonzero(is_box & (labels == largest))
     if len(x) < 50:
         return None
     return cv2.convexHull(np.stack([x, y], axis=1).astype(np.float32))[:, 0] + 0.5

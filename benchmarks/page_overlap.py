@@ -142,7 +142,7 @@ def measure(address: str, film: NumberedFilm, file: Path, options: argparse.Name
     with tempfile.TemporaryDirectory() as profile, open_page("about:blank", Path(profile), flags) as page:
         page.prepare(KEEP_PIXELS)
         page.open(address)
-        page.resize(720, 640)
+        page.resize(400, 460)
         page.wait_for("document.body.dataset.state === 'idle'")
         page.run("document.getElementById('show-model').click()")
         page.click("#start")

@@ -111,6 +111,15 @@ def test_a_body_that_says_to_be_too_large_is_refused_before_it_comes(guarded):
 
 
 @pytest.mark.usefixtures("localized_in_the_end")
+def test_who_sends_a_body_that_nobody_needs_still_reads_the_answer(guarded, client):
+    data = bytes(3 * 2**20)
+    for _ in range(5):
+        assert code_of(client.post("v1/localize?fx=nan", content=data)) == (400, "bad_parameter")
+        assert code_of(httpx.post(f"{guarded.url.partition('#')[0]}v1/localize", content=data))[0] == 401
+        assert code_of(client.post("v1/localize", content=bytes(9 * 2**20))) == (413, "body_too_large")
+
+
+@pytest.mark.usefixtures("localized_in_the_end")
 def test_an_endless_body_is_cut(guarded):
     chunk = b"10000\r\n" + b"\xff\xd8\xff" + bytes(65533) + b"\r\n"
     with socket.create_connection(guarded.address, 15) as raw:

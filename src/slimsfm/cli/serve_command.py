@@ -11,6 +11,7 @@ from slimsfm.cli.options import Advanced, Argument
 from slimsfm.cli.output import console
 from slimsfm.errors import InputError
 from slimsfm.localization import LocalizationOptions
+from slimsfm.serve.options import LIVE_TRACKING
 from slimsfm.tracking import TrackerOptions
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def serve(
     origins: tuple[str, ...] = (),
     workers: int | None = None,
     localization: Annotated[LocalizationOptions, Advanced()] = LocalizationOptions(),
-    tracker: Annotated[TrackerOptions, Advanced()] = TrackerOptions(),
+    tracker: Annotated[TrackerOptions, Advanced()] = LIVE_TRACKING,
     networks: Annotated[Networks, Advanced()] = Networks(),
     reading: Annotated[Reading, Advanced()] = Reading(),
 ) -> None:
@@ -103,9 +104,10 @@ def check_can_serve() -> None:
 def serve_until_stopped(options: "ServeOptions", binding: "Binding", *, opens_page: bool = False) -> None:
     """Serve until Ctrl-C or SIGTERM, and print where; if asked, open the page and play the film."""
     from slimsfm.serve.announcing import announcement
-    from slimsfm.serve.running import MapServer, silence_uvicorn
+    from slimsfm.serve.running import MapServer, silence_uvicorn, use_few_arenas
 
     silence_uvicorn()
+    use_few_arenas()
     server = MapServer(options, binding)
 
     def announce() -> None:

@@ -14,6 +14,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slimsfm.hosts import host_of, is_this_machine
+from slimsfm.serve.bodies import BODY_READ, drain
 from slimsfm.serve.errors import ApiError
 from slimsfm.serve.service import Service
 
@@ -84,7 +85,7 @@ class Guard:
                 status = message["status"]
                 answer = MutableHeaders(scope=message)
                 self._add_headers(asked, answer)
-                if status >= 400 and scope["method"] == "POST" and not scope.get("slimsfm.body_read"):
+                if status >= 400 and scope["method"] == "POST" and not scope.get(BODY_READ):
                     answer["connection"] = "close"  # what is left of the body is not read
             await send(message)
 
@@ -98,6 +99,7 @@ class Guard:
                 await response(scope, receive, send_with_headers)
         except ApiError as error:
             service.metrics.count("refused_total", code=error.code)
+            await drain(scope, receive, service.options.limits)
             await error_response(error, asked.id)(scope, receive, send_with_headers)
         except Exception:
             _LOGGER.exception("request %s failed", asked.id)

@@ -5,7 +5,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pycolmap
@@ -123,7 +123,7 @@ def _check_file(path: Path) -> None:
 def _model(parts: list[trimesh.Trimesh], box: Box, world_from_model: pycolmap.Sim3d | None) -> Model:
     colors = np.concatenate([_colors(part) for part in parts])
     textured = any(_image(part) is not None for part in parts)
-    joined = trimesh.util.concatenate([(_with_texture if textured else _bare)(part) for part in parts])
+    joined: Any = trimesh.util.concatenate([(_with_texture if textured else _bare)(part) for part in parts])
     normals = np.concatenate([np.asarray(part.vertex_normals) for part in parts])
     vertices = np.asarray(joined.vertices, dtype=np.float64)
     if not np.all(np.isfinite(vertices)) or not np.any(np.ptp(vertices, axis=0)):
@@ -160,25 +160,25 @@ def _image(part: trimesh.Trimesh) -> PillowImage.Image | None:
 
 def _colors(part: trimesh.Trimesh) -> Float64[np.ndarray, "n 3"]:
     """Color of each vertex; white where a texture says all."""
+    visual: Any = part.visual
     if _image(part) is None:
-        visual = part.visual
         if isinstance(visual, TextureVisuals):
             found = np.broadcast_to(np.asarray(visual.material.main_color), (len(part.vertices), 4))
         else:
             found = np.asarray(visual.vertex_colors)
         return found[:, :3] / 255.0
-    factor = getattr(part.visual.material, "baseColorFactor", None)
+    factor = getattr(visual.material, "baseColorFactor", None)
     color = np.ones(3) if factor is None else np.asarray(factor)[:3] / 255.0
     return np.tile(color, (len(part.vertices), 1))
 
 
 def _with_texture(part: trimesh.Trimesh) -> trimesh.Trimesh:
     """A part whose material is an image alone, white if it had none: these can be joined into one."""
-    image = _image(part)
+    image, old = _image(part), cast("Any", part.visual)
     if image is None:
         image, uv = PillowImage.new("RGB", (4, 4), (255, 255, 255)), np.full((len(part.vertices), 2), 0.5)
     else:
-        uv = np.asarray(part.visual.uv)
+        uv = np.asarray(old.uv)
     visual = TextureVisuals(uv=uv, material=SimpleMaterial(image=_shrunk(image)))
     return trimesh.Trimesh(part.vertices, part.faces, visual=visual, process=False)
 

@@ -7,6 +7,10 @@ from slimsfm.execution import num_cores
 from slimsfm.localization import LocalizationOptions
 from slimsfm.tracking import TrackerOptions
 
+LIVE_TRACKING = TrackerOptions(search_every=3)
+"""How clients are tracked by default: an object that comes back is sought in every third whole frame, because
+somebody waits for it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ServeLimits:
@@ -86,7 +90,7 @@ class ServeOptions:
     localization: LocalizationOptions = LocalizationOptions()
     """How images are localized."""
 
-    tracker: TrackerOptions = TrackerOptions()
+    tracker: TrackerOptions = LIVE_TRACKING
     """How frames are tracked."""
 
     limits: ServeLimits = field(default_factory=ServeLimits)

@@ -1,10 +1,12 @@
 """Run the application: address, certificate and token, start and stop."""
 
 import asyncio
+import ctypes
 import logging
 import secrets
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from slimsfm.serve.options import ServeOptions
 from slimsfm.serve.service import Service
 
 _STOP_S = 15
+_M_ARENA_MAX = -8  # of glibc's mallopt
 _MAX_HEADERS = 16 * 2**10
 _KEEP_ALIVE_S = 10
 
@@ -160,3 +163,13 @@ def silence_uvicorn() -> None:
     """Let uvicorn log what went wrong, and nothing else."""
     for name in ("uvicorn", "uvicorn.error"):
         logging.getLogger(name).setLevel(logging.ERROR)
+
+
+def use_few_arenas() -> None:
+    """Let all threads share two heaps, where the C library is glibc.
+
+    By default it gives threads heaps of their own, which only grow: after a minute of mixed traffic, a server
+    had 630 MB instead of 395.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
