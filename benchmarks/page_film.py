@@ -26,6 +26,7 @@ CELLS = 2 + 2 * BITS  # white, black, then each bit and its opposite
 BOX_COLOR = (23, 242, 179)
 """Color of the box that the page draws when it is sure, RGB: `COLORS.found` in objects.js."""
 
+_SPECK = 0.1  # largest area of a speck of this color, over that of a part of the box
 _SIMILAR = 70  # largest distance of a color to that of the box
 
 
@@ -100,13 +101,14 @@ def read_number(picture: Image) -> int | None:
 def drawn_outline(picture: Image) -> Points2D | None:
     """The hull of the pixels that have the color of the page's box; None where there are hardly any."""
     away = np.linalg.norm(picture.astype(float) - BOX_COLOR, axis=2)
-    is_box = cv2.morphologyEx((away < _SIMILAR).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    joined = cv2.dilate(is_box, np.ones((7, 7), np.uint8))  # over what hides an edge
+    is_box = (away < _SIMILAR).astype(np.uint8)
+    joined = cv2.dilate(is_box, np.ones((7, 7), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
-    if len(stats) < 2:
+    sizes = stats[1:, cv2.CC_STAT_AREA]
+    if not len(sizes):
         return None
-    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    y, x = np.nonzero(is_box & (labels == largest))
+    large = 1 + np.flatnonzero(sizes > _SPECK * sizes.max())  # not specks of the scene
+    y, x = np.nonzero((is_box > 0) & np.isin(labels, large))
     if len(x) < 50:
         return None
     return cv2.convexHull(np.stack([x, y], axis=1).astype(np.float32))[:, 0] + 0.5
