@@ -91,8 +91,10 @@ class Adding:
         )
         label = "localize new photos" if self.rounds == 1 else f"localize new photos again ({self.rounds})"
         found = {name: next(outcomes) for name in self.progress(names, label)}
+        believed = sum(self.photos.cameras[name].source in _TRUSTED for name in self.added)
+        lone = _lone_cameras(found, cameras, believed)
         for name, one in found.items():
-            reason = self._doubt(one)
+            reason = self._doubt(one) or lone.get(name)
             self.reasons.pop(name, None)
             if reason:
                 self.reasons[name] = reason
@@ -179,6 +181,28 @@ class Adding:
         if any(camera_fault(larger.model.camera(i)) for i in guessed):
             return extend_map(self.map, new, matches, seed=self.options.seed)
         return larger
+
+
+def _lone_cameras(
+    found: Mapping[str, SearchResult], cameras: Mapping[str, QueryCamera], believed: int
+) -> dict[str, str]:
+    """Photos whose matches contradict the camera of the map, though most others of that camera agree with it.
+
+    They would enter with a camera of their own, and the camera of photos that come later would be unknown.
+    `believed` is the number of photos that have entered with the camera of the map.
+    """
+    posed = [name for name, one in found.items() if one.best.pose and cameras[name].source in _TRUSTED]
+    alone = [name for name in posed if _estimated(found[name])]
+    if 2 * len(alone) > len(posed) + believed:
+        return {}
+    return {
+        name: f"its matches contradict the camera of the map: {', '.join(_estimated(found[name]))}"
+        for name in alone
+    }
+
+
+def _estimated(found: SearchResult) -> tuple[str, ...]:
+    return found.best.pose.estimated if found.best.pose else ()
 
 
 def _place(found: SearchResult) -> LocalizedImage:
