@@ -27,7 +27,7 @@ NOT_TYPED = (
 NOT_INSTALLED = ("hloc",)
 """Packages that the tests cannot require. Python lines that import one are compiled, not run."""
 
-GIVEN = {"how-to/own-matcher.md": ("map",), "how-to/metres-and-place.md": ("map", "positions.csv")}
+GIVEN = {"how-to/own-matcher.md": ("map",), "how-to/meters-and-place.md": ("map", "positions.csv")}
 """Further inputs of a page."""
 
 _BLOCK = re.compile(r"^```(?P<language>\w*)\n(?P<lines>.*?)^```$", re.MULTILINE | re.DOTALL)

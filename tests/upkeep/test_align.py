@@ -1,4 +1,4 @@
-"""Maps get metres, a place and a direction up; what the data do not say is refused."""
+"""Maps get meters, a place and a direction up; what the data do not say is refused."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -146,17 +146,17 @@ def test_swapped_coordinates_are_refused(many, unaligned):
         align(unaligned, known(many, wgs84_of_enu(swapped, ORIGIN), is_geographic=True))
 
 
-def test_a_distance_gives_metres_and_keeps_the_place(many):
+def test_a_distance_gives_meters_and_keeps_the_place(many):
     place = Georeference(latitude=55.7, longitude=13.2, height=40.0)
     there = replace(many, info=replace(many.info, georeference=place, unit="unknown"))
     a, b = list(many.images)[:2]
     length = float(np.linalg.norm(np.diff(positions(many)[:2], axis=0)))
-    found = align(there, Distance(between=(a, b), metres=3 * length))
+    found = align(there, Distance(between=(a, b), meters=3 * length))
     np.testing.assert_allclose(positions(found.map), 3 * positions(many), atol=1e-9)
     assert found.map.info.unit == "metre"
     assert found.map.info.georeference is place
     first, last = (str(i) for i in many.point3D_ids[[0, -1]])
-    assert align(there, Distance(between=(first, last), metres=1.0)).map.info.unit == "metre"
+    assert align(there, Distance(between=(first, last), meters=1.0)).map.info.unit == "metre"
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_a_distance_gives_metres_and_keeps_the_place(many):
 )
 def test_a_distance_of_nothing_is_refused(many, ends, message):
     with pytest.raises(InputError, match=message):
-        align(many, Distance(between=ends, metres=1.0))
+        align(many, Distance(between=ends, meters=1.0))
 
 
 def test_up_is_found_from_the_cameras(unaligned):

@@ -57,7 +57,7 @@ COMMANDS = {
     "forget": Entry("forget_command:forget_of", "drop what a map no longer needs, and say what that costs"),
     "localize": Entry("localize_command:localize", "estimate the camera poses of new images"),
     "track": Entry("track_command:track", "estimate the camera pose of every frame of a video"),
-    "align": Entry("align_command:align_map", "give a map its unit and its place: metres, up, Earth"),
+    "align": Entry("align_command:align_map", "give a map its unit and its place: meters, up, Earth"),
     "info": Entry("info_command:info", "show what a map contains"),
     "view": Entry("view_command:view", "show a map in the browser and localize images in it"),
     "serve": Entry("serve_command:serve", "localize images that phones, robots and programs send"),

@@ -23,13 +23,13 @@ class AlignArguments:
     """What to align a map by: one of these."""
 
     distance: float | None = None
-    """Distance in metres of the two images or points that `--between` names."""
+    """Distance in meters of the two images or points that `--between` names."""
 
     between: tuple[str, ...] = ()
     """Two images by name, or two points by their id in the COLMAP model."""
 
     tag_size: float | None = None
-    """Side in metres of the black square of printed tags that the photos in `--images` show."""
+    """Side in meters of the black square of printed tags that the photos in `--images` show."""
 
     tag_family: Family = "apriltag-36h11"
     """Family of the tags."""
@@ -38,7 +38,7 @@ class AlignArguments:
     """The tag that has this size, where the photos show others too. By default all have."""
 
     positions: Path | None = None
-    """Known positions of images: CSV with the columns name, x, y, z in metres, or name, latitude, longitude,
+    """Known positions of images: CSV with the columns name, x, y, z in meters, or name, latitude, longitude,
     height."""
 
     gps: bool = False
@@ -75,7 +75,7 @@ class AlignArguments:
         if self.distance is not None:
             if len(self.between) != 2:
                 raise InputError("distance needs --between A B: two images of the map, or ids of two points")
-            return Distance(between=(self.between[0], self.between[1]), metres=self.distance)
+            return Distance(between=(self.between[0], self.between[1]), meters=self.distance)
         if self.tag_size is not None:
             folder = self._photos("tag-size")
             return Tag(images=folder, side=self.tag_size, family=self.tag_family, number=self.tag_number)
@@ -101,7 +101,7 @@ def align_map(
     json: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Give a map its unit and its place: metres, up, and the frame of known positions, Earth or another map.
+    """Give a map its unit and its place: meters, up, and the frame of known positions, Earth or another map.
 
     Says what the result rests on and how exact it is. What the given data do not determine, or what
     contradicts itself or the photos, is refused.

@@ -49,7 +49,7 @@ class LimitArguments:
     """The same for the 90th percentile of the corner error. By default 2 if possible, as above."""
 
     max_error: str | None = None
-    """Largest corner error, as the 90th percentile that is predicted: in map units, which are metres if the
+    """Largest corner error, as the 90th percentile that is predicted: in map units, which are meters if the
     map's unit is metre, such as 0.05, or relative to the diagonal d of the box, such as 0.01d."""
 
     max_bytes: str | None = None

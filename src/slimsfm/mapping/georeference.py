@@ -27,7 +27,7 @@ class GeoPose:
     """Degrees east, WGS84."""
 
     height: float
-    """Metres above the ellipsoid, or above what the heights that the map was aligned by refer to."""
+    """Meters above the ellipsoid, or above what the heights that the map was aligned by refer to."""
 
     quaternion_xyzw: tuple[float, float, float, float]
     """`enu_from_cam`, with a real part that is not negative."""
@@ -44,7 +44,7 @@ class GeoPose:
 class Georeference:
     """A point on Earth, the frame of east, north and up there, and how the map's frame lies in it.
 
-    `slimsfm.align` makes maps whose own frame is that of east, north and up, in metres.
+    `slimsfm.align` makes maps whose own frame is that of east, north and up, in meters.
 
     Raises:
         ValueError: The point is not on Earth.
@@ -57,10 +57,10 @@ class Georeference:
     """Degrees east of the origin, WGS84."""
 
     height: float
-    """Metres of the origin above the ellipsoid, or above what the given heights refer to."""
+    """Meters of the origin above the ellipsoid, or above what the given heights refer to."""
 
     enu_from_world: pycolmap.Sim3d = field(default_factory=pycolmap.Sim3d)
-    """From the map's frame to metres east, north and up of the origin."""
+    """From the map's frame to meters east, north and up of the origin."""
 
     def __post_init__(self) -> None:
         if not abs(self.latitude) <= 90 or not abs(self.longitude) <= 180 or not np.isfinite(self.height):
@@ -68,7 +68,7 @@ class Georeference:
             raise ValueError(f"latitude, longitude and height must be on Earth, got {place}")
 
     def wgs84_of(self, points3D_in_world: Points3D) -> Float64[np.ndarray, "n 3"]:
-        """Latitude and longitude in degrees and height in metres of points of the map."""
+        """Latitude and longitude in degrees and height in meters of points of the map."""
         enu = self.enu_from_world * points3D_in_world
         return wgs84_of_enu(enu, np.array([self.latitude, self.longitude, self.height]))
 
@@ -135,7 +135,7 @@ def enu_from_ecef(latitude: float, longitude: float) -> Float64[np.ndarray, "3 3
 def enu_of_wgs84(
     wgs84: Float64[np.ndarray, "n 3"], origin: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Metres east, north and up of an origin; places are latitude and longitude in degrees and height."""
+    """Meters east, north and up of an origin; places are latitude and longitude in degrees and height."""
     earth = pycolmap.GPSTransform()
     ecef = earth.ellipsoid_to_ecef(wgs84) - earth.ellipsoid_to_ecef(origin[None])
     return ecef @ enu_from_ecef(origin[0], origin[1]).T

@@ -1,4 +1,4 @@
-"""Give a map its unit and its place: metres, up, and the frame of known positions, Earth or another map."""
+"""Give a map its unit and its place: meters, up, and the frame of known positions, Earth or another map."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +25,12 @@ class Distance:
     between: tuple[str, str]
     """Names of two images, or ids of two points of the COLMAP model."""
 
-    metres: float
+    meters: float
     """Their distance."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.metres < np.inf:
-            raise ValueError(f"metres must be positive, got {self.metres}")
+        if not 0 < self.meters < np.inf:
+            raise ValueError(f"meters must be positive, got {self.meters}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Tag:
     """Folder of the photos of the map."""
 
     side: float
-    """Length of a side of the black square, in metres."""
+    """Length of a side of the black square, in meters."""
 
     family: Family = "apriltag-36h11"
     """Family of the tags."""
@@ -92,8 +92,8 @@ By = Distance | Tag | Positions | Gps | OtherMap | GravityUp
 def align(map: Map, by: By, *, progress: ProgressBar = silent) -> Alignment:
     """Move a full or reduced map into a frame that means something.
 
-    - `Distance` and `Tag` give metres. The frame only grows or shrinks about its origin.
-    - `Positions` give metres and the frame of the positions. If these are latitude, longitude and height, or
+    - `Distance` and `Tag` give meters. The frame only grows or shrinks about its origin.
+    - `Positions` give meters and the frame of the positions. If these are latitude, longitude and height, or
       with `Gps`, the frame has its origin at the center of the box and axes east, north and up, and the map
       knows its place (`info.georeference`).
     - `OtherMap` gives frame, unit and place of another map.
@@ -131,7 +131,7 @@ def align(map: Map, by: By, *, progress: ProgressBar = silent) -> Alignment:
 
 def _by_distance(map: Map, by: Distance) -> Alignment:
     measured = distance_between(map, *by.between)
-    scaling = _scaling(by.metres / measured.length)
+    scaling = _scaling(by.meters / measured.length)
     name = f"the distance of {' and '.join(by.between)}"
     return Alignment(
         map=in_new_frame(map, scaling, name, unit="metre", georeference=map.info.georeference),

@@ -30,7 +30,7 @@ class KnownPositions:
     """Positions of cameras by name of the image."""
 
     by_name: Mapping[str, Position]
-    """In metres, or latitude and longitude in degrees and height in metres."""
+    """In meters, or latitude and longitude in degrees and height in meters."""
 
     is_geographic: bool = False
     """Whether they are latitude, longitude and height (WGS84)."""
@@ -54,7 +54,7 @@ def _is_on_earth(position: Position) -> bool:
 def read_positions(path: str | Path) -> KnownPositions:
     """Read positions of images from a table in CSV.
 
-    Its header is `name,x,y,z`, in metres, or `name,latitude,longitude,height`, in degrees and metres; further
+    Its header is `name,x,y,z`, in meters, or `name,latitude,longitude,height`, in degrees and meters; further
     columns are ignored. Names are those of the map.
 
     Raises:
@@ -66,7 +66,7 @@ def read_positions(path: str | Path) -> KnownPositions:
         found = [one for one in (_METRIC, _GEOGRAPHIC) if {"name", *one} <= set(rows.fieldnames or ())]
         if not found:
             raise InputError(
-                f"{path}: must have the columns name, x, y, z in metres, or name, latitude, longitude, height"
+                f"{path}: must have the columns name, x, y, z in meters, or name, latitude, longitude, height"
             )
         positions: dict[str, Position] = {}
         for line, row in enumerate(rows, start=2):

@@ -19,7 +19,7 @@ class TagScale:
     """The scale by tags."""
 
     scale: float
-    """Metres per map unit."""
+    """Meters per map unit."""
 
     relative_bound: float
     """Error that 95 % stay below."""
@@ -37,7 +37,7 @@ def scale_of_tags(map: Map, views: dict[int, list[TagView]], side: float, number
     Args:
         map: The map.
         views: The views of each tag.
-        side: Side of each in metres.
+        side: Side of each in meters.
         number: The tag to use; all if None.
 
     Raises:
