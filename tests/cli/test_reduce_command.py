@@ -24,6 +24,8 @@ class Pointed:
     outcome: Outcome
 
 
+REMEMBERED = 100  # bytes of an option in map.json, which remembers how a map was made
+
 @pytest.fixture(scope="session")
 def pointed(boulder, tmp_path_factory) -> Pointed:
     """The rendered object's map, reduced without further options."""
@@ -193,8 +195,9 @@ def test_the_procedure_of_the_paper_is_followed_and_named(boulder, tmp_path):
 def test_it_keeps_to_a_largest_size(reduced_to, use):
     who = ("--selector", "random") if use == "direct" else ()
     _, first = reduced_to("--for", use, "--max-loss", "100%", *who)
-    _, second = reduced_to("--for", use, "--max-bytes", f"{first / 1000}kB", "--overwrite", *who)
-    assert second <= first
+    allowed = first + REMEMBERED
+    _, second = reduced_to("--for", use, "--max-bytes", f"{allowed / 1000}kB", "--overwrite", *who)
+    assert second <= allowed
 
 
 def test_it_keeps_to_a_number_of_points(reduced_to):

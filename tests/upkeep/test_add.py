@@ -219,7 +219,7 @@ def test_features_are_extracted_as_those_of_the_map(half, tmp_path):
 
 def test_reduced_maps_name_the_map_that_they_were_made_from(half, tmp_path):
     full, options = half.map, ReduceOptions(for_="images", seed=3)
-    slim = with_parent(keep_images(full, list(full.images)[:8]), full, half.path, tmp_path / "slim", options)
+    slim = keep_images(with_parent(full, half.path, tmp_path / "slim", options), list(full.images)[:8])
     write_map(slim, tmp_path / "slim")
     slim = read_map(tmp_path / "slim")
     with pytest.raises(MapError, match="reduced map"):

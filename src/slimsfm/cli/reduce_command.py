@@ -191,8 +191,9 @@ def reduce(
     full, options = read_reducible(map), choosing.options
     if as_ is not None:
         options = repeated_options(read_map(as_), as_, full)
+    full = with_parent(full, map, output, options)
     reduced = reduce_map(full, options, graph=kept_graph(map, execution), progress=shown)
-    write_map(with_parent(reduced.map, full, map, output, options), output, overwrite=overwrite)
+    write_map(reduced.map, output, overwrite=overwrite)
     for note in reduced.notes:
         console.print(f"note: {note}")
     print_dominating_set(reduced, options)

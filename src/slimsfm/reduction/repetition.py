@@ -11,22 +11,24 @@ from slimsfm.files import plain
 from slimsfm.mapping.info import Parent
 from slimsfm.mapping.map import Map
 from slimsfm.reduction.reduced import ReduceOptions
+from slimsfm.selection import REPLACED_SELECTORS
 
 
-def with_parent(slim: Map, full: Map, path: Path, output: Path, options: ReduceOptions) -> Map:
-    """A reduced map that remembers the map that it was made from.
+def with_parent(full: Map, path: Path, output: Path, options: ReduceOptions) -> Map:
+    """A full map whose reductions remember it: so the size of a reduced map includes what it remembers.
 
     Args:
-        slim: The reduced map.
         full: The full map.
-        path: Folder of the full map.
+        path: Its folder.
         output: Folder that the reduced map will have.
-        options: How it was reduced.
+        options: How it will be reduced.
     """
     relative = Path(os.path.relpath(path.absolute(), output.absolute())).as_posix()
-    chosen = json.loads(json.dumps(_changed(asdict(options), asdict(ReduceOptions())), default=str))
+    selector = options.selector and REPLACED_SELECTORS.get(options.selector, options.selector)
+    values = asdict(replace(options, selector=selector))
+    chosen = json.loads(json.dumps(_changed(values, asdict(ReduceOptions())), default=str))
     parent = Parent(path=relative, fingerprint=full.fingerprint, options=chosen)
-    return replace(slim, info=replace(slim.info, parent=parent))
+    return replace(full, info=replace(full.info, parent=parent))
 
 
 def _changed(values: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:

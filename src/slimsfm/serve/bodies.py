@@ -49,7 +49,7 @@ async def drain(scope: Scope, receive: Receive, limits: ServeLimits) -> None:
     is_asking = any(name == b"expect" for name, _ in scope["headers"])  # whether to send the body at all
     if scope["method"] != "POST" or scope.get(BODY_READ) or is_asking:
         return
-    left, more = limits.max_body_bytes, True
+    left, more = 2 * limits.max_body_bytes, True  # a body that is a little too large is read to its end
     with suppress(TimeoutError):
         async with asyncio.timeout(_DRAIN_S):
             while more and left > 0:
