@@ -6,7 +6,7 @@ A headless Chromium has a rendered film as its camera: a hand walks around a pri
 looks away for a second. The pixels that the page shows tell which frame of the film it is (a bar code) and
 where the box is drawn. Their overlap with the true outline in this frame, intersection over union, includes
 all that can be wrong: the pose, the intrinsics, the painter, and whether picture and pose belong together.
-Writes OUTPUT/map, OUTPUT/film-30.y4m and the pictures of the best and the worst overlap.
+Writes OUTPUT/map, a reduced map, OUTPUT/film-30.y4m and the pictures of the best and the worst overlap.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from slimsfm.datasets.base import map_object
 from slimsfm.datasets.onepose import read_object
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
 from slimsfm.mapping.io import write_map
+from slimsfm.reduction import reduce
 from slimsfm.synthetic.render import render
 from slimsfm.synthetic.scene import (
     elsewhere,
@@ -89,7 +90,8 @@ def object_map(folder: Path) -> Path:
         takes = SynthesisOptions(objects=(NAME,), mapping_frames=36, query_frames=2)
         synthesize(folder / "objects", takes, overwrite=True)
         with tempfile.TemporaryDirectory() as workspace:
-            write_map(map_object(read_object(folder / "objects" / NAME), Path(workspace)), path)
+            full = map_object(read_object(folder / "objects" / NAME), Path(workspace))
+            write_map(reduce(full).map, path)
     return path
 
 

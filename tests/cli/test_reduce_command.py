@@ -26,6 +26,7 @@ class Pointed:
 
 REMEMBERED = 100  # bytes of an option in map.json, which remembers how a map was made
 
+
 @pytest.fixture(scope="session")
 def pointed(boulder, tmp_path_factory) -> Pointed:
     """The rendered object's map, reduced without further options."""
