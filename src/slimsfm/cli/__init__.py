@@ -94,6 +94,7 @@ _INTRODUCTION = """slimsfm makes COLMAP maps small and localizes images in them 
   slimsfm build PHOTOS -o MAP            or: slimsfm import COLMAP_MODEL -o MAP
   slimsfm reduce MAP -o SMALL            predicts what the reduction costs
   slimsfm localize SMALL IMAGES -o poses.json
+  slimsfm serve SMALL                    the same for phones, robots and programs
   slimsfm benchmark images PHOTOS -o RESULTS
   slimsfm demo                           shows all of this in under 3 minutes
 
