@@ -177,7 +177,7 @@ class Localizer:
 
     def _localization(self, found: SearchResult, camera: QueryCamera, extract_seconds: float) -> Localization:
         matches, pose, evidence = found.best.matches, found.best.pose, found.best.evidence
-        reason = self._failure(found.best)
+        reason = found.best.doubt(self.options.min_confidence)
         if reason:
             pose = evidence = None
         return Localization(
@@ -193,15 +193,6 @@ class Localizer:
             seconds=Seconds(extract=extract_seconds, match=found.match_seconds, pose=found.pose_seconds),
             orientation=self.map.info.orientation,
         )
-
-    def _failure(self, best: RoundResult) -> str | None:
-        """Why there is no pose; None if there is one that is sure enough."""
-        if best.pose is None:
-            count = len(best.matches.points)
-            return f"no pose agrees with enough of {count} matches" if count else "no matches with the map"
-        if best.confidence < self.options.min_confidence:
-            return f"the confidence {best.confidence:.2f} is below {self.options.min_confidence:g}"
-        return None
 
     def _query(
         self, features: Features, camera: pycolmap.Camera, factor: float, image: Image | None

@@ -54,6 +54,15 @@ class RoundResult:
         """Confidence of the pose; below zero if there is none."""
         return -1.0 if self.pose is None else self.pose.confidence or 0.0
 
+    def doubt(self, min_confidence: float) -> str | None:
+        """Why there is no pose of at least this confidence; None if there is one."""
+        if self.pose is None:
+            count = len(self.matches.points)
+            return f"no pose agrees with enough of {count} matches" if count else "no matches with the map"
+        if self.confidence < min_confidence:
+            return f"the confidence {self.confidence:.2f} is below {min_confidence:g}"
+        return None
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchResult:

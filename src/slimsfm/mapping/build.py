@@ -1,7 +1,6 @@
 """Build maps from photos by Structure from Motion."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -11,7 +10,6 @@ from slimsfm.errors import InputError, ReconstructionError
 from slimsfm.execution import OpenExecutor
 from slimsfm.exif import Exif, ignored_values, read_device, read_orientation
 from slimsfm.features import Extractor, load_extractor
-from slimsfm.files import working_folder
 from slimsfm.geometry import Box
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.cameras import devices_by_camera
@@ -28,7 +26,7 @@ from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.sfm import colmap_warnings
 from slimsfm.mapping.support import measure
 from slimsfm.mapping.work import BuildOptions, BuildWork, KnownPoses, MapParts, ModelBuilder, build_key
-from slimsfm.mapping.workspace import Workspace
+from slimsfm.mapping.workspace import Workspace, opened_workspace
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.skipping import SkippedPhotos
 
@@ -77,7 +75,7 @@ def build_map(
     given_box = read_box(options.box) if options.box else (known.box if known else None)
     extractor = _extractor(options)
     workers = Workers(open_executor=open_executor, min_seconds=min_seconds)
-    with _opened(workspace) as folder, colmap_warnings():
+    with opened_workspace(workspace) as folder, colmap_warnings():
         chosen = choose_photos(sources, folder, options, inputs, known, progress)
         known, skipped, exifs, folder_of_photos = chosen.known, chosen.skipped, chosen.exifs, chosen.folder
         photos = MaskedPhotos(
@@ -213,17 +211,6 @@ def _origins(quality: ModelQuality, work: BuildWork) -> dict[str, str]:
         return dict.fromkeys(quality.focal_lengths, "given")
     has_prior = {name: work.cameras[name].has_prior_focal_length for name in quality.focal_lengths}
     return {name: "EXIF" if prior else "guessed" for name, prior in has_prior.items()}
-
-
-@contextmanager
-def _opened(workspace: str | Path | None) -> Iterator[Path]:
-    """The workspace, or a temporary one. The open file of features stays readable after it is removed."""
-    if workspace is None:
-        with working_folder() as folder:
-            yield folder
-    else:
-        Path(workspace).mkdir(parents=True, exist_ok=True)
-        yield Path(workspace)
 
 
 def _extractor(options: BuildOptions) -> Extractor:

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from slimsfm.files import remove
+from slimsfm.files import remove, working_folder
 from slimsfm.files.resumable import KEY_FILE
 from slimsfm.progress import ProgressBar, counted
 
@@ -34,6 +34,17 @@ FEATURES, DATABASE, SFM = "features.h5", "database.db", "sfm"
 _EXTRACTED, _MATCHED = "extracted", "matched"
 _BLOCK = 10  # pairs of a file of matches: about a second of work
 _LATEST = (FEATURES, DATABASE, f"{DATABASE}-shm", f"{DATABASE}-wal", _EXTRACTED, _MATCHED)
+
+
+@contextmanager
+def opened_workspace(folder: str | Path | None) -> Iterator[Path]:
+    """A folder, made if it is missing, or a temporary one. Open files stay readable after that is removed."""
+    if folder is None:
+        with working_folder() as temporary:
+            yield temporary
+    else:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        yield Path(folder)
 
 
 class Workspace:

@@ -2,17 +2,16 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slimsfm.errors import InputError, MapError
 from slimsfm.execution import OpenExecutor
-from slimsfm.files import working_folder
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.sfm import colmap_warnings
+from slimsfm.mapping.workspace import opened_workspace
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.added_info import described
 from slimsfm.upkeep.coverage import Coverage, coverage
@@ -91,7 +90,7 @@ def add(
     """
     check_extendable(map)
     workers = Workers(open_executor=open_executor, min_seconds=min_seconds)
-    with _opened(workspace) as folder, colmap_warnings():
+    with opened_workspace(workspace) as folder, colmap_warnings():
         photos = read_new_photos(
             map,
             Path(images),
@@ -166,13 +165,3 @@ def _none_of(photos: NewPhotos, reasons: Mapping[str, str]) -> str:
         for names in by_reason.values()
     )
     return f"none of {len(photos.names)} photos could be added; they may show another place: {why}"
-
-
-@contextmanager
-def _opened(workspace: str | Path | None) -> Iterator[Path]:
-    if workspace is None:
-        with working_folder() as folder:
-            yield folder
-    else:
-        Path(workspace).mkdir(parents=True, exist_ok=True)
-        yield Path(workspace)

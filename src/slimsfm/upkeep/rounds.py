@@ -94,7 +94,7 @@ class Adding:
         believed = sum(self.photos.cameras[name].source in _TRUSTED for name in self.added)
         lone = _lone_cameras(found, cameras, believed)
         for name, one in found.items():
-            reason = self._doubt(one) or lone.get(name)
+            reason = one.best.doubt(self.options.min_confidence) or lone.get(name)
             self.reasons.pop(name, None)
             if reason:
                 self.reasons[name] = reason
@@ -108,15 +108,6 @@ class Adding:
                 localizer.localize_features(features[name], self.photos.cameras[name]) for name in some
             ],
         )
-
-    def _doubt(self, found: SearchResult) -> str | None:
-        best = found.best
-        if best.pose is None:
-            count = len(best.matches.points)
-            return f"no pose agrees with enough of {count} matches" if count else "no matches with the map"
-        if best.confidence < self.options.min_confidence:
-            return f"the confidence {best.confidence:.2f} is below {self.options.min_confidence:g}"
-        return None
 
     def _enter(self, found: Mapping[str, SearchResult]) -> set[str]:
         """Extend the map by photos whose poses are sure; returns those that its matches bear out."""
