@@ -46,7 +46,7 @@ def scheduler() -> Iterator[str]:
     dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
     with (
         dask.config.set(
-            {"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": "2s"}
+            {"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": "10s"}
         ),
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
