@@ -24,10 +24,7 @@ from slimsfm.tracking.video import write_video
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
-FILM, FRAMES = (
-    160,
-    15,
-)  # frames around the object, and how many of them are rendered
+FILM, FRAMES = 160, 15  # frames around the object, and how many of them are rendered
 FRAMES_PER_SECOND = 4.0  # two frames per second are the photos
 NEW = (5, 11)
 

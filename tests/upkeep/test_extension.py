@@ -1,16 +1,15 @@
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pycolmap
 import pytest
 
-from scenes import exact_map
 from slimsfm.errors import MapError
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import check_map
 from slimsfm.mapping.subset import keep_images
 from slimsfm.upkeep.extension import JoinedMapping, NewImage, extend_map
+from wrong_poses import matched_map
 
 TAKEN = "003.png", "006.png"
 
@@ -18,16 +17,7 @@ TAKEN = "003.png", "006.png"
 @pytest.fixture(scope="module")
 def full():
     """Every pair of images is matched as its tracks say."""
-    map_ = exact_map(8, 150, reach_deg=80)
-    matches = {}
-    for a, b in combinations(map_.images, 2):
-        _, rows_a, rows_b = np.intersect1d(
-            map_.observations[a].points, map_.observations[b].points, return_indices=True
-        )
-        if len(rows_a):
-            rows = map_.observations[a].rows[rows_a], map_.observations[b].rows[rows_b]
-            matches[a, b] = np.stack(rows, axis=1)
-    return replace(map_, matches=matches)
+    return matched_map(8, 150)
 
 
 def without(map_, names):

@@ -81,6 +81,7 @@ class MapInfo:
 
     parent: Parent | None = None
     """The map that this one was reduced from. None for full maps and for maps of older versions."""
+
     wrong_poses: tuple[str, ...] = ()
     """Images of the full map whose poses a check found wrong, by name: nothing is measured by them, and no
     image must be kept to localize them."""

@@ -77,7 +77,7 @@ def certificate_for(hosts: tuple[str, ...], folder: Path | None = None) -> Certi
 
 
 def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """The authority in a folder, made anew if there is none or it ends soon."""
+    """The authority in a folder, created if there is none or it expires soon."""
     path, key_path = folder / "authority.pem", folder / "authority.key"
     if path.exists() and key_path.exists():
         known = x509.load_pem_x509_certificate(path.read_bytes())

@@ -94,7 +94,7 @@ class _Connection:
         await self._send({"type": "welcome", "session": self._id, "maps": maps})
 
     async def _receive(self) -> None:
-        """Keep the newest frame; a further hello begins anew."""
+        """Keep the newest frame; a further hello restarts tracking."""
         idle_s = self._service.options.limits.idle_s
         while True:
             try:

@@ -1,17 +1,14 @@
 """What a map says of itself after photos were added."""
 
-import re
 from collections.abc import Collection
 from dataclasses import replace
 
 from slimsfm.mapping.cameras import devices_by_camera
-from slimsfm.mapping.info import MapInfo
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.quality import ModelQuality
 from slimsfm.mapping.support import measure
 from slimsfm.upkeep.new_photos import NewPhotos
-
-_ADDED = re.compile(r", (\d+) added$")
+from slimsfm.upkeep.origins import with_count
 
 
 def described(before: Map, larger: Map, photos: NewPhotos, added: Collection[str]) -> Map:
@@ -29,19 +26,13 @@ def described(before: Map, larger: Map, photos: NewPhotos, added: Collection[str
     }
     info = replace(
         old,
-        origin=_origin(old, len(added)),
+        origin=with_count(old.origin, len(added), "added"),
         notes=tuple(dict.fromkeys((*old.notes, *photos.notes))),
         exif_orientations={**old.exif_orientations, **tags},
         devices={**old.devices, **new_cameras},
         quality=old.quality and _quality(old.quality, larger, photos, added),
     )
     return replace(larger, info=info)
-
-
-def _origin(old: MapInfo, count: int) -> str:
-    before = _ADDED.search(old.origin)
-    total = count + (int(before[1]) if before else 0)
-    return f"{_ADDED.sub('', old.origin)}, {total} added"
 
 
 def _quality(old: ModelQuality, larger: Map, photos: NewPhotos, added: Collection[str]) -> ModelQuality:

@@ -1,6 +1,5 @@
 """Forget points that nothing matches any more and images that others replace, and say what that costs."""
 
-import re
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -21,9 +20,9 @@ from slimsfm.mapping.support import measure
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.add import check_extendable
 from slimsfm.upkeep.missed_points import count_misses
+from slimsfm.upkeep.origins import with_count
 
 _TESTS = 16  # images that are left out to measure what is lost
-_FORGOTTEN = re.compile(r", (\d+) images forgotten$")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,16 +136,11 @@ def _without(map: Map, kept: Collection[str], missed: Ids) -> Map:
     smaller = replace(slim, model=model)
     old, gone = map.info, len(map.images) - len(smaller.images)
     info = replace(
-        old, quality=old.quality and _quality(old.quality, smaller), origin=_origin(old.origin, gone)
+        old,
+        quality=old.quality and _quality(old.quality, smaller),
+        origin=with_count(old.origin, gone, "images forgotten"),
     )
     return replace(smaller, info=info)
-
-
-def _origin(origin: str, count: int) -> str:
-    before = _FORGOTTEN.search(origin)
-    total = count + (int(before[1]) if before else 0)
-    rest = _FORGOTTEN.sub("", origin)
-    return f"{rest}, {total} images forgotten" if total else rest
 
 
 def _quality(old: ModelQuality, smaller: Map) -> ModelQuality:

@@ -2,7 +2,7 @@
 
 An image and a reference are joined by verified matches, which no pose has a part in. Where the matched
 keypoint of the reference observes a point, the match is a 2D-3D match of the image. The position of the point
-must not depend on the image either: it is triangulated anew from the other observations.
+must not depend on the image either: it is triangulated again from the other observations.
 """
 
 from collections import defaultdict
@@ -28,9 +28,7 @@ _MIN_ANGLE = np.radians(1.0)  # between the rays of a point
 _MOST_MATCHES = 800  # per pose: more of them hardly change it
 _MOST_REFERENCES = 24  # of an image
 _NEED = 2  # observations of a point
-_SCATTER = (
-    4.0  # times the median error of the inliers: how far off a match may be that agrees with another pose
-)
+_SCATTER = 4.0  # times the median error of the inliers: by how much a match may be off another pose
 _LEAST_PX = 1.5  # of that
 
 
