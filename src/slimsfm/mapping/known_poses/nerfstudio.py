@@ -137,10 +137,10 @@ def read(path: Path) -> GivenPoses:
 def _note(traces: list[str]) -> str:
     if traces:
         return (
-            f"the unit of the poses is taken as unknown, because {', '.join(traces)} points to Structure from "
-            "Motion; `unit='metre'` says otherwise"
+            f"the unit of the poses is taken as unknown, because {', '.join(traces)} points to Structure "
+            "from Motion; `unit='metre'` says otherwise"
         )
     return (
-        "the poses are taken as a device's, in meters, because nothing in the file points to Structure from "
-        "Motion; `unit='unknown'` says otherwise"
+        "the poses are taken as a device's, in meters, because nothing in the file points to Structure "
+        "from Motion; `unit='unknown'` says otherwise"
     )
