@@ -116,9 +116,19 @@ def drawn_outline(picture: Image) -> Points2D | None:
 
 def shown(page: Page) -> tuple[Image, str]:
     """The pixels of the page's canvas at some moment, and the page's state."""
-    data, state = page.run("[document.getElementById('view').toDataURL(), document.body.dataset.state]")
+    data, state = shown_as_png(page)
+    return decoded(data), state
+
+
+def shown_as_png(page: Page) -> tuple[str, str]:
+    """The page's canvas at some moment as a PNG in a data URL, and the page's state."""
+    return tuple(page.run("[document.getElementById('view').toDataURL(), document.body.dataset.state]"))
+
+
+def decoded(data: str) -> Image:
+    """The RGB pixels of an image in a data URL."""
     with PilImage.open(BytesIO(base64.b64decode(data.partition(",")[2]))) as image:
-        return np.array(image.convert("RGB")), state
+        return np.array(image.convert("RGB"))
 
 
 def picture_in(canvas: Image, camera: pycolmap.Camera) -> Image:

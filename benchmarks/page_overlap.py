@@ -23,7 +23,17 @@ import numpy as np
 import pycolmap
 from PIL import Image as PilImage
 
-from page_film import KEEP_PIXELS, RECORD, NumberedFilm, Return, overlap, picture_in, returns, shown
+from page_film import (
+    KEEP_PIXELS,
+    RECORD,
+    NumberedFilm,
+    Return,
+    decoded,
+    overlap,
+    picture_in,
+    returns,
+    shown_as_png,
+)
 from slimsfm.datasets.base import map_object
 from slimsfm.datasets.onepose import read_object
 from slimsfm.datasets.synthetic import SynthesisOptions, synthesize
@@ -52,6 +62,8 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-rasterization",
+    "--disable-gpu-memory-buffer-video-frames",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
@@ -111,12 +123,13 @@ def serving(path: Path) -> Iterator[str]:
 
 
 def pictures(page: Page, film: NumberedFilm, seconds: float) -> Iterator[tuple[np.ndarray, str]]:
-    """What is shown of the film, and the page's state."""
-    end = monotonic() + seconds
+    """What is shown of the film, and the page's state; decoded at the end, which takes time of the cores."""
+    end, taken = monotonic() + seconds, []
     while monotonic() < end:
-        canvas, state = shown(page)
-        yield picture_in(canvas, film.camera), state
+        taken.append(shown_as_png(page))
         sleep(0.05)
+    for data, state in taken:
+        yield picture_in(decoded(data), film.camera), state
 
 
 def main() -> None:
@@ -149,10 +162,12 @@ def measure(address: str, film: NumberedFilm, file: Path, options: argparse.Name
         page.run("document.getElementById('show-model').click()")
         page.click("#start")
         page.wait_for("document.body.dataset.state === 'found'", 60)
+        page.send("Network.disable")  # it would report each frame that is sent, which takes time of the cores
         page.run(RECORD)
         overlaps = list(measured(film, page, options))
         record = page.run("record")
-        hosts = {one.split("/")[2] for one in page.requests() if one.startswith(("http", "ws"))}
+        later = page.run("performance.getEntriesByType('resource').map((one) => one.name)")
+        hosts = {one.split("/")[2] for one in (*page.requests(), *later) if one.startswith(("http", "ws"))}
         figures = page.run(
             "document.getElementById('figures').textContent + ', ' + document.getElementById('figures').title"
         )

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import jaxtyping
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
@@ -16,6 +17,18 @@ from slimsfm.weights import use_runtime
 if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores: threads of each would collide
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"
     threadpool_limits(1)
+
+
+AS_USERS_RUN_IT = ("cli", "docs", "examples", "serve", "report")
+"""Folders of tests of the whole program, without the checks of types that double its time; the tests of the
+library, which all of it is made of, have them."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Check types or not."""
+    folder = item.path.relative_to(Path(__file__).parent).parts[0]
+    jaxtyping.config.update("jaxtyping_disable", folder in AS_USERS_RUN_IT)
 
 
 @pytest.fixture(autouse=True)

@@ -57,11 +57,12 @@ def _from_front(bounds: Gains, front: Some, rest: int | None, gains: Callable[[I
     fresh, size = np.zeros(len(front), bool), _BATCH
     while True:
         place = int(values.argmax())
-        if values[place] <= _NEGLIGIBLE or _is_better(rest, bounds, int(front[place]), float(values[place])):
-            break
+        item, gain = int(front[place]), float(values[place])
+        if gain <= _NEGLIGIBLE or (rest is not None and (-float(bounds[rest]), rest) < (-gain, item)):
+            break  # nothing gains, or the best of the rest comes first
         if fresh[place]:
             values[place] = 0.0
-            yield int(front[place])
+            yield item
             fresh[:], size = False, _BATCH
         else:
             batch = _stale(values, fresh, size)
@@ -69,11 +70,6 @@ def _from_front(bounds: Gains, front: Some, rest: int | None, gains: Callable[[I
             fresh[batch] = True
             size *= 2
     bounds[front] = values
-
-
-def _is_better(rest: int | None, bounds: Gains, item: int, gain: float) -> bool:
-    """Whether the best of the rest, if there is any, comes before an item of this gain."""
-    return rest is not None and (-float(bounds[rest]), rest) < (-gain, item)
 
 
 def _stale(bounds: Gains, fresh: Mask, size: int) -> Some:

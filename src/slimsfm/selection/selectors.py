@@ -225,10 +225,7 @@ class KCover:
         self._gains = np.bincount(
             self._problem.usable.indices[open_uses], minlength=self._problem.num_points
         ).astype(np.float64)
-        return greedy_order(self._gains, self._now, self.free)
-
-    def _now(self, points: Ids) -> Gains:
-        return self._gains[points]
+        return greedy_order(self._gains, self._gains.__getitem__, self.free)
 
 
 def random_points(problem: SelectionProblem, count: int, *, seed: int = 0) -> Ids:

@@ -14,7 +14,7 @@
  * on it: no box is better than a wrong one.
  */
 import { cameraFrom } from "./cameras.js";
-import { Encoder, FRAME_SIDE, fitted } from "./encoding.js";
+import { Copier, Encoder, FRAME_SIDE, SHOWN_SIDE, fitted } from "./encoding.js";
 import { NO_TURN, poseFrom, turned } from "./pose.js";
 import { PoseFilter } from "./smoothing.js";
 import { directionTo, nextState } from "./states.js";
@@ -28,6 +28,7 @@ import { watchFrames } from "./camera.js";
 
 const HOLD_MS = 1500;
 const CARRY_MS = 1000;
+const ALONE_MS = 60; // between pictures alone, without a gyroscope: localization may need the same processor
 
 /**
  * What is shown, at some time after the frame of the last pose was taken: that frame, the newest with the pose carried
@@ -51,6 +52,8 @@ export class Live {
   constructor(parts) {
     this.parts = parts;
     this.encoder = new Encoder();
+    this.held = new Copier();
+    this.alone = new Copier();
     /** @type {import("./camera.js").Source | undefined} */
     this.source = undefined;
     /** @type {(() => void) | null} */
@@ -65,13 +68,13 @@ export class Live {
     this.known = null;
     /** @type {Known | null} The last pose, however old, to say where the object went. */
     this.lastSeen = null;
-    /** @type {{sequence: number, captured: number, picture: ImageBitmap, jpeg: ArrayBuffer} | null} */
+    /** @type {{sequence: number, captured: number, picture: HTMLVideoElement | OffscreenCanvas | HTMLCanvasElement, jpeg: ArrayBuffer} | null} */
     this.sent = null;
     /** @type {Map<string, PoseFilter>} */
     this.filters = new Map();
     this.answered = /** @type {number[]} */ ([]);
     this.size = { width: 0, height: 0 };
-    this.newest = this.lastSent = 0;
+    this.newest = this.lastSent = this.lastAlone = 0;
     this.encoding = false;
   }
 
@@ -87,7 +90,7 @@ export class Live {
     this.stopWatching = null;
     this.source?.stop();
     this.source = undefined;
-    this.forget();
+    this.sent = null;
   }
 
   get runs() {
@@ -113,10 +116,9 @@ export class Live {
     const captured = (this.lastSent = this.newest);
     this.encoding = true;
     try {
-      const picture = await createImageBitmap(this.parts.video);
-      const jpeg = await this.encoder.jpeg(picture, fitted(picture.width, picture.height, FRAME_SIDE));
-      if (!this.runs || !this.parts.socket.ready) return picture.close();
-      this.forget();
+      const picture = this.newestPicture(this.held);
+      const jpeg = await this.encoder.jpeg(picture, fitted(this.size.width, this.size.height, FRAME_SIDE));
+      if (!this.runs || !this.parts.socket.ready) return;
       this.sent = { sequence: this.parts.socket.send(captured, jpeg), captured, picture, jpeg };
     } catch {
       // the camera has no frame at the moment, such as while it is being switched
@@ -125,20 +127,24 @@ export class Live {
     }
   }
 
-  forget() {
-    this.sent?.picture.close();
-    this.sent = null;
-  }
-
   /** @param {number} captured */
   showNewest(captured) {
-    const { viewer, video, preview } = this.parts;
+    const { viewer, preview } = this.parts;
     const { known } = this;
     const how = known ? manner(this.hasGyroscope, captured - known.captured) : "alone";
-    if (how === "held" || viewer.painter.busy) return;
+    const isEarly = !this.hasGyroscope && captured - this.lastAlone < ALONE_MS;
+    if (how === "held" || isEarly || viewer.painter.busy) return;
     const overlay = known && how === "carried" ? { ...known, pose: this.carried(known, captured) } : null;
-    viewer.show(video, this.size, overlay, this.state === "searching" || this.state === "lost" ? preview() : null);
+    const isSought = this.state === "searching" || this.state === "lost";
+    viewer.show(this.newestPicture(this.alone), this.size, overlay, isSought ? preview() : null);
+    this.lastAlone = captured;
     if (known && how === "alone") this.waitFor(known);
+  }
+
+  /** The video, or a copy of its picture to keep, where no gyroscope brings a pose to the newest one. @param {Copier} copier */
+  newestPicture(copier) {
+    const { video } = this.parts;
+    return this.hasGyroscope ? video : copier.copy(video, fitted(video.videoWidth, video.videoHeight, SHOWN_SIDE));
   }
 
   /** Say that answers are late. @param {Known} known */

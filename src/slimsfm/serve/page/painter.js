@@ -43,7 +43,8 @@ function linked(gl, source) {
 export class Painter {
   /** @param {HTMLCanvasElement} canvas @throws {Error} The browser has no WebGL2. */
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, powerPreference: "high-performance" });
+    // lines and points have soft edges of their own; without a GPU, antialiasing takes more time than all else
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This browser has no WebGL2, which the page draws with.");
     this.canvas = canvas;
     this.gl = gl;

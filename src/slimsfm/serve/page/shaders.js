@@ -38,7 +38,7 @@ void main() {
 }`,
 };
 
-/** Each line is a quad of constant width; `corner` is (0 or 1 along, -1 or 1 across). */
+/** Each line is a quad of constant width with soft edges; `corner` is (0 or 1 along, -1 or 1 across). */
 export const LINES = {
   vertex: `${SEEN}
 uniform vec2 size;
@@ -47,6 +47,7 @@ uniform vec4 paint;
 in vec2 corner;
 in vec3 from, to, tint;
 out vec4 shade;
+out float away;
 
 void main() {
   vec3 a = seen(from), b = seen(to);
@@ -62,15 +63,19 @@ void main() {
   vec2 along = length(way) > 0.001 ? normalize(way) : vec2(1.0, 0.0);
   vec2 aside = vec2(-along.y, along.x) * corner.y + along * (2.0 * corner.x - 1.0);
   gl_Position = corner.x < 0.5 ? start : stop;
-  gl_Position.xy += aside * width / size * gl_Position.w;
+  gl_Position.xy += aside * (width + 1.0) / size * gl_Position.w;
+  away = 0.5 * (width + 1.0) * corner.y;
 }`,
   fragment: `#version 300 es
 precision mediump float;
 uniform float opacity;
+uniform highp float width;
 in vec4 shade;
+in float away;
 out vec4 color;
 void main() {
-  color = vec4(shade.rgb * opacity, opacity);
+  float covered = opacity * clamp(0.5 * (width + 1.0) - abs(away), 0.0, 1.0);
+  color = vec4(shade.rgb, 1.0) * covered;
 }`,
 };
 
@@ -88,12 +93,13 @@ void main() {
   fragment: `#version 300 es
 precision mediump float;
 uniform float opacity, core;
+uniform highp float width;
 in vec3 shade;
 out vec4 color;
 void main() {
   float away = 2.0 * length(gl_PointCoord - 0.5);
-  if (away > 1.0) discard;
-  color = vec4(away > core ? vec3(0.0) : shade, 1.0) * opacity;
+  float covered = opacity * clamp(0.5 * width * (1.0 - away), 0.0, 1.0);
+  color = vec4(away > core ? vec3(0.0) : shade, 1.0) * covered;
 }`,
 };
 
