@@ -57,7 +57,7 @@ def test_a_damaged_graph_is_computed_again_and_never_a_wrong_one(few_points, tmp
     for length in range(0, len(whole), 41):
         path.write_bytes(whole[:length])
         assert not is_kept(few_points, tmp_path)
-    for position in range(len(whole)):
+    for position in range(0, len(whole), 3):
         damaged = bytearray(whole)
         damaged[position] ^= 1 << (position % 8)
         path.write_bytes(damaged)

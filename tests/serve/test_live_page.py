@@ -95,8 +95,8 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def watched(opened, film):
-    """Watches until all has happened, or for 45 s: a busy machine answers late."""
-    page, found, end = opened.page, Watched([], [], []), time.monotonic() + 45
+    """Watches until all has happened, or for 20 s: a busy machine answers late."""
+    page, found, end = opened.page, Watched([], [], []), time.monotonic() + 20
     page.click("#start")
     page.wait_for(f"{STATE} === 'found'", 60)
     page.run(RECORD)

@@ -75,6 +75,7 @@ def write_onnx(part: Exportable, method: str, path: Path) -> None:
             _Positional(part.network).eval(),
             tuple(part.inputs.values()),
             dynamo=True,
+            optimize=False,  # onnxruntime does it, in less time
             dynamic_shapes=(axes,),
             input_names=list(part.inputs),
             output_names=list(part.outputs),
