@@ -29,7 +29,7 @@ def add_photos(
     """Add photos to a map, without moving what it has.
 
     Photos are localized, matched with their likely neighbors, triangulated and adjusted. Those that are not
-    sure are tried again when others have entered, and listed if they never are. Reference graphs of the map
+    sure are tried again when similar ones entered, and listed if they never are. Reference graphs of the map
     are extended. Photos that are in the map already do not count.
 
     Args:

@@ -67,9 +67,10 @@ def add(
     """Add the photos of a folder to a map.
 
     Each photo is localized in the map. Those that are sure are matched with their likely neighbors,
-    triangulated, and adjusted (`extend_map`); then the others are tried again in the larger map, until none
-    enters any more. Photos that only see each other therefore never enter. Ids, poses and cameras of the old
-    images and the frame of the map stay as they are, unless `options.refine` is set.
+    triangulated, and adjusted (`extend_map`); then those of the others that look similar to them are tried
+    again in the larger map, until none enters any more. Photos that only see each other therefore never
+    enter. Ids, poses and cameras of the old images and the frame of the map stay as they are, unless
+    `options.refine` is set.
 
     Args:
         map: A full map of keypoints.

@@ -9,11 +9,13 @@ import pycolmap
 
 from slimsfm.arrays import IndexPairs
 from slimsfm.execution import map_on_threads, num_cores
+from slimsfm.features import unit_rows
 from slimsfm.lenses import camera_fault
 from slimsfm.localization import LocalizationOptions, Localizer
 from slimsfm.localization.cameras import QueryCamera
 from slimsfm.localization.round_result import SearchResult
 from slimsfm.localization.shared_cameras import share_cameras
+from slimsfm.localization.strategies import ImageRanking
 from slimsfm.mapping.blocks import Workers
 from slimsfm.mapping.cameras import camera_key
 from slimsfm.mapping.map import Map
@@ -25,6 +27,7 @@ from slimsfm.upkeep.neighbors import LocalizedImage, likely_neighbors
 from slimsfm.upkeep.new_matches import match_new
 from slimsfm.upkeep.new_photos import NewPhotos
 
+_SIMILAR = 10  # images of the map, by which a photo is tried again if they are new
 _TRUSTED = ("given", "map")  # sources of intrinsics that are not refined
 
 
@@ -33,7 +36,7 @@ class AddOptions:
     """How photos are added to a map."""
 
     min_confidence: float = 0.9
-    """Confidence that a pose needs, from 0 to 1. Photos below it are tried again when others have entered."""
+    """Confidence that a pose needs, from 0 to 1. Photos below it are tried again when similar ones enter."""
 
     matcher: str = "nearest"
     """Matcher of the features, as in `build`: nearest, lightglue or superglue."""
@@ -70,16 +73,29 @@ class Adding:
 
     def run(self) -> None:
         """Add what is sure, until nothing is."""
-        left = list(self.photos.names)
-        while left:
+        left = tried = list(self.photos.names)
+        while tried:
             self.rounds += 1
-            found = self._localize(left)
+            found = self._localize(tried)
             sure = {name: one for name, one in found.items() if name not in self.reasons}
             entered = self._enter(sure) if sure else set()
             if not entered:
                 return
             self.added |= entered
             left = [name for name in left if name not in entered]
+            tried = self._similar_to(entered, left)
+
+    def _similar_to(self, entered: set[str], left: list[str]) -> list[str]:
+        """The photos that may match those that entered, which are among the images most similar to them."""
+        ranking, features = ImageRanking(self.map), self.photos.extracted.features
+        new = [place for place, name in enumerate(self.map.images) if name in entered]
+        found = []
+        for name in left:
+            strongest = np.argsort(-features[name].scores, kind="stable")
+            similarities = ranking.similarities(unit_rows(features[name].descriptors[strongest]))
+            if np.isin(np.argsort(-similarities, kind="stable")[:_SIMILAR], new).any():
+                found.append(name)
+        return found
 
     def _localize(self, names: list[str]) -> dict[str, SearchResult]:
         """Localize photos in the map so far; `reasons` holds why some are not sure afterwards."""
