@@ -167,8 +167,8 @@ def similarity_from_poses(pairs: PosePairs, *, seed: int = 0) -> MapSimilarity:
     """
     if len(pairs.names) < _LEAST_IMAGES:
         raise InputError(
-            f"the maps have {len(pairs.names)} {pairs.how} in common (of {pairs.tried}), but it takes at "
-            f"least {_LEAST_IMAGES}; use maps that show the same place"
+            f"too few images link the maps ({pairs.how}: {len(pairs.names)} of {pairs.tried}, and it takes "
+            f"at least {_LEAST_IMAGES}); use maps that show the same place"
         )
     turns = np.array(
         [
