@@ -19,7 +19,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # there are as many processes as cores:
     threadpool_limits(1)
 
 
-AS_USERS_RUN_IT = ("cli", "docs", "examples", "serve", "report")
+AS_USERS_RUN_IT = ("cli", "docs", "evaluation", "examples", "serve", "report")
 """Folders of tests of the whole program, without the checks of types that double its time; the tests of the
 library, which all of it is made of, have them."""
 
