@@ -61,17 +61,14 @@ def errors_across(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the poses of the second half's photos relative to those of the first: distance and angle."""
     distances, angles = [], []
-    for name, place in renamed.items():
-        if name in first or place not in merged.images:
-            continue
-        pose = merged.images[place].cam_from_world()
+    for name in renamed.keys() - set(first):
+        pose = merged.images[renamed[name]].cam_from_world()
         for other in first:
-            if other in merged.images:
-                found = pose * merged.images[other].cam_from_world().inverse()
-                wanted = true[name] * true[other].inverse()
-                centers = [one.inverse().translation for one in (found, wanted)]
-                distances.append(float(np.linalg.norm(centers[0] - centers[1])))
-                angles.append(rotation_error_deg(found, wanted))
+            found = pose * merged.images[other].cam_from_world().inverse()
+            wanted = true[name] * true[other].inverse()
+            centers = [one.inverse().translation for one in (found, wanted)]
+            distances.append(float(np.linalg.norm(centers[0] - centers[1])))
+            angles.append(rotation_error_deg(found, wanted))
     return np.array(distances), np.array(angles)
 
 

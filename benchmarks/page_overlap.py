@@ -62,7 +62,7 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--disable-gpu-rasterization",
+    "--disable-gpu-rasterization",  # what software renders is copied back and forth less often without it
     "--disable-gpu-memory-buffer-video-frames",
     "--disable-background-networking",
     "--disable-component-update",

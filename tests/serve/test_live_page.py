@@ -1,11 +1,9 @@
 """The page in a headless Chromium whose camera is a film: a poster, out of sight for a while."""
 
-import base64
 import json
 import os
 import time
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +20,7 @@ from page_film import (
     RECORD,
     NumberedFilm,
     Return,
+    decoded,
     overlap,
     picture_in,
     returns,
@@ -315,8 +314,3 @@ def test_the_painter_projects_as_the_library_does(opened):
         y, x = np.nonzero(np.abs(drawn.astype(int) - color).max(axis=2) <= 4)
         assert len(x) > 10
         np.testing.assert_allclose([x.mean() + 0.5, y.mean() + 0.5], expected, atol=0.6)
-
-
-def decoded(data: str) -> np.ndarray:
-    with Image.open(BytesIO(base64.b64decode(data.partition(",")[2]))) as image:
-        return np.array(image.convert("RGB"))

@@ -83,7 +83,7 @@ class Adding:
                 return
             self.added |= entered
             left = [name for name in left if name not in entered]
-            tried = self._similar_to(entered, left)
+            tried = self._similar_to(entered, left) if left else []
 
     def _similar_to(self, entered: set[str], left: list[str]) -> list[str]:
         """The photos that may match those that entered, which are among the images most similar to them."""
