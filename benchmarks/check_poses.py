@@ -90,7 +90,16 @@ def print_room(name: str, output: Path) -> None:
     blamed = sorted(names - room.wrong)
     print(f"{name}: {len(room.map.images)} images, really wrong: {', '.join(sorted(room.wrong)) or 'none'}")
     print(f"found {len(names & room.wrong)} of {len(room.wrong)}, blamed: {', '.join(blamed) or 'none'}")
-    for one in (*found.wrong, *found.contradicted_pairs, *found.unlocalized, *found.threads):
+    repaired = repair(room.map, found).map
+    left = room.wrong & repaired.images.keys()
+    print(f"after the repair: {len(repaired.images)} images, of which {len(left)} were wrong")
+    for one in (
+        *found.wrong,
+        *found.misplaced,
+        *found.contradicted_pairs,
+        *found.unlocalized,
+        *found.threads,
+    ):
         print(f"  {type(one).__name__}: {one.sentence}")
 
 

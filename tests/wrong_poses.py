@@ -1,6 +1,6 @@
 """An exact map whose images are all matched, and the same map with wrong poses."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from itertools import combinations
 
@@ -43,3 +43,23 @@ def turned(map_: Map, name: str, angle_deg: float) -> Map:
     """The map in which an image was moved around the middle of the scene."""
     turn = pycolmap.Rotation3d(np.array([0.0, 0.0, np.radians(angle_deg)]))
     return with_poses(map_, {name: map_.images[name].cam_from_world() * pycolmap.Rigid3d(turn, np.zeros(3))})
+
+
+def laid_over(map_: Map, names: Collection[str], angle_deg: float) -> Map:
+    """The map folded: some images, and all that they alone see, were moved around the middle of the scene."""
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.0, np.radians(angle_deg)])), np.zeros(3))
+    folded = with_poses(map_, {name: map_.images[name].cam_from_world() * turn for name in names})
+    part, model = {map_.images[name].image_id for name in names}, folded.model
+    for point_id in sorted(model.point3D_ids()):
+        point = model.point3D(point_id)
+        seen = [(one.image_id, one.point2D_idx) for one in point.track.elements]
+        places, color = (point.xyz.copy(), turn.inverse() * point.xyz), point.color.copy()
+        model.delete_point3D(point_id)
+        for is_part, place in enumerate(places):
+            track = pycolmap.Track()
+            for image_id, row in seen:
+                if (image_id in part) == is_part:
+                    track.add_element(image_id, row)
+            if track.length() >= 2:
+                model.add_point3D(place, track, color)
+    return replace(map_, model=model)

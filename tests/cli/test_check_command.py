@@ -1,11 +1,13 @@
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from commands import contents, slimsfm
 from slimsfm.mapping import read_map, write_map
 from slimsfm.mapping.subset import keep_images
-from wrong_poses import matched_map, swapped
+from wrong_poses import laid_over, matched_map, swapped
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +50,23 @@ def test_repair_writes_a_map_that_passes(maps, tmp_path):
     assert done.code == 0
     assert "set right: 001.png, 006.png" in done.out
     assert slimsfm("check", tmp_path / "repaired").code == 0
+
+
+def test_misplaced_images_are_named_drawn_and_dropped(tmp_path):
+    part = [f"{number:03d}.png" for number in range(25, 32)]
+    folded = laid_over(matched_map(36, 200), part, 180)
+    across = [pair for pair in folded.matches if len({*pair} & {*part}) == 1]
+    few = {pair: np.roll(folded.matches[pair][:12], 1, axis=0) for pair in across}
+    for rows in few.values():
+        rows[:, 1] = np.roll(rows[:, 1], 1)
+    write_map(replace(folded, matches={**folded.matches, **few}), tmp_path / "folded")
+    done = slimsfm("check", tmp_path / "folded", "--json", "--figure", tmp_path / "cameras.svg")
+    found = json.loads(done.out)
+    assert (done.code, found["wrong"], [one["name"] for one in found["misplaced"]]) == (1, [], part)
+    assert "7 of them wrong" in (tmp_path / "cameras.svg").read_text()
+    done = slimsfm("check", tmp_path / "folded", "--repair", "-o", tmp_path / "repaired")
+    assert (done.code, f"dropped: {', '.join(part)}" in done.out) == (0, True)
+    assert not read_map(tmp_path / "repaired").images.keys() & set(part)
 
 
 def test_output_without_repair_is_the_map_with_marks(maps, tmp_path):

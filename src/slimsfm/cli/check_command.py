@@ -22,7 +22,7 @@ from slimsfm.upkeep.repair import repair as repair_map
 EXIT_FOUND = 1
 """Exit code if poses are wrong, as linters have it for what they find."""
 
-_STYLES = {"wrong poses": "bold red", "contradicted pairs": "bold red", "threads": "bold red"}
+_SERIOUS = "wrong poses", "misplaced", "contradicted pairs", "threads"
 
 
 def check(
@@ -97,21 +97,21 @@ def _print(found: MapCheck, repaired: Repaired | None, output: Path | None, watc
         "d is the diagonal of the box"
     )
     for title, findings in _sections(found).items():
-        console.print(
-            f"{title}: {len(findings) or 'none'}", style=_STYLES.get(title, "yellow") if findings else ""
-        )
+        style = "bold red" if title in _SERIOUS else "yellow"
+        console.print(f"{title}: {len(findings) or 'none'}", style=style if findings else "")
         for one in findings:
             console.print(f"  {one.sentence}")
     if repaired:
         for title, names in (("set right", repaired.moved), ("dropped", repaired.dropped)):
             console.print(f"{title}: {', '.join(names) or 'none'}")
-    wrong = plural(len(found.wrong), "wrong pose")
+    wrong = plural(len(found.wrong_names), "wrong pose")
     finish(f"{f'{output}: ' if output else ''}checked, {wrong}", watch)
 
 
 def _sections(found: MapCheck) -> dict[str, Sequence[Any]]:
     return {
         "wrong poses": found.wrong,
+        "misplaced": found.misplaced,
         "contradicted pairs": found.contradicted_pairs,
         "not localized by any others": found.unlocalized,
         "threads": found.threads,
@@ -128,6 +128,7 @@ def _facts(found: MapCheck, repaired: Repaired | None) -> dict[str, Any]:
         "matches_from": found.matches_from,
         "usual_error": found.usual_error,
         "wrong": [_wrong(one) for one in found.wrong],
+        "misplaced": [asdict(one) for one in found.misplaced],
         "contradicted_pairs": [asdict(one) for one in found.contradicted_pairs],
         "unlocalized": [asdict(one) for one in found.unlocalized],
         "threads": [asdict(one) for one in found.threads],

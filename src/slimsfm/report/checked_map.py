@@ -1,6 +1,6 @@
 """A picture of a checked map: the cameras from above, and where those that are wrong should stand."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pycolmap
@@ -26,7 +26,7 @@ def check_picture(map: Map, found: MapCheck) -> Figure:
     the rest by a thread have a color of their own.
     """
     ground = _ground(map)
-    count = len(found.wrong)
+    count = len(found.wrong_names)
     label = f"{found.images} cameras from above, {count} of them wrong"
     with styled():
         figure = new_figure(7.0, 6.0, label)
@@ -42,17 +42,23 @@ def check_picture(map: Map, found: MapCheck) -> Figure:
         for number, thread in enumerate(found.threads):
             part = [poses[name] for name in thread.part]
             _draw_cameras(axes, part, ground, length, COLORS[number % len(COLORS)])
+        wrong = [poses[name] for name in found.wrong_names]
+        _draw_cameras(axes, wrong, ground, length, CHOSEN)
         for one in found.wrong:
-            _draw_cameras(axes, [one.cam_from_world], ground, length, CHOSEN)
             _draw_cameras(axes, [one.others_cam_from_world], ground, length, CHOSEN, hollow=True)
             start, end = (_centers([p]) @ ground.T for p in (one.cam_from_world, one.others_cam_from_world))
             axes.plot(*np.concatenate([start, end]).T, color=CHOSEN, linewidth=0.9, linestyle="--")
-            if count <= _LABELED:
-                axes.annotate(
-                    one.name, start[0], (4, 4), textcoords="offset points", color=CHOSEN, fontsize=7
-                )
-        axes.set_title(f"{label}; dashed: to where the others say" if count else label)
+        _label(axes, dict(zip(found.wrong_names, _centers(wrong) @ ground.T, strict=True)))
+        axes.set_title(f"{label}; dashed: to where the others say" if found.wrong else label)
     return figure
+
+
+def _label(axes: Axes, places: Mapping[str, np.ndarray]) -> None:
+    """Names at some places, unless they are many."""
+    for name, place in places.items() if len(places) <= _LABELED else ():
+        axes.annotate(
+            name, (place[0], place[1]), (4, 4), textcoords="offset points", color=CHOSEN, fontsize=7
+        )
 
 
 def _ground(map: Map) -> Float64[np.ndarray, "2 3"]:

@@ -13,8 +13,9 @@ from slimsfm.mapping.matching import verify_matches
 from slimsfm.mapping.pairs import Matches, choose_pairs, exhaustive_pairs
 from slimsfm.mapping.support import MIN_AGREEING, Pair, agreement, trusted_pairs
 from slimsfm.progress import ProgressBar, silent
-from slimsfm.upkeep.findings import ContradictedPair, MapCheck, Unlocalized, WrongPose
+from slimsfm.upkeep.findings import ContradictedPair, MapCheck, Misplaced, Unlocalized, WrongPose
 from slimsfm.upkeep.likeness import find_blurred, find_duplicates
+from slimsfm.upkeep.misplaced import find_misplaced
 from slimsfm.upkeep.threads import find_threads
 from slimsfm.upkeep.verdicts import Court, Trial, Verdicts
 from slimsfm.upkeep.witnesses import Witnesses
@@ -28,7 +29,9 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
     Each image is localized from disjoint sets of the others as if it were a query: by their verified matches,
     in which no pose has a part, and by points that are triangulated without the image. Where several sets
     agree that it stands elsewhere, its pose is wrong. Which poses are wrong is decided jointly: see
-    `upkeep.verdicts`. The rest is cheap: see `upkeep.threads` and `upkeep.likeness`.
+    `upkeep.verdicts`. Images that were laid over a place that looks alike are confirmed by what looks alike,
+    but do not match the rest: see `upkeep.misplaced`. What else is found is cheap: see `upkeep.threads` and
+    `upkeep.likeness`.
 
     Args:
         map: The map. Without stored matches, its features are matched again, which takes most of the time.
@@ -47,8 +50,9 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
     matches = matches_of(map, progress)
     witnesses = Witnesses(map, matches)
     agreeing = agreement(map.images, matches)
-    verdicts = _decide(map, matches, agreeing, witnesses, progress)
+    verdicts, misplaced = _decide(map, matches, agreeing, witnesses, progress)
     names, wrong = witnesses.names, _wrong_of(map, verdicts)
+    out = {one.name for one in (*wrong, *misplaced)}
     neighbors = {name: [names[j] for j in witnesses.neighbors(i)] for i, name in enumerate(names)}
     return MapCheck(
         images=len(names),
@@ -57,19 +61,21 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
         matches_from="map" if map.matches else "matched again",
         usual_error=_usual_error(verdicts),
         wrong=wrong,
-        contradicted_pairs=_contradicted_pairs(map, matches, agreeing, {one.name for one in wrong}),
-        unlocalized=_unlocalized(witnesses, verdicts),
+        misplaced=misplaced,
+        contradicted_pairs=_contradicted_pairs(map, matches, agreeing, out),
+        unlocalized=_unlocalized(witnesses, verdicts, out),
         duplicates=find_duplicates(map, matches),
         blurred=find_blurred(map, neighbors, None if images is None else Path(images), progress),
-        threads=find_threads(names, matches, agreeing, {one.name for one in wrong}),
+        threads=find_threads(names, matches, agreeing, out),
     )
 
 
-def wrong_poses(map: Map, progress: ProgressBar = silent) -> tuple[WrongPose, ...]:
-    """The images of a full map whose poses the others contradict: what benchmarks need of `check`."""
+def wrong_poses(map: Map, progress: ProgressBar = silent) -> tuple[WrongPose | Misplaced, ...]:
+    """The images of a full map whose poses are wrong, by name: what benchmarks need of `check`."""
     matches = matches_of(map, progress)
     agreeing = agreement(map.images, matches)
-    return _wrong_of(map, _decide(map, matches, agreeing, Witnesses(map, matches), progress))
+    verdicts, misplaced = _decide(map, matches, agreeing, Witnesses(map, matches), progress)
+    return tuple(sorted((*_wrong_of(map, verdicts), *misplaced), key=lambda one: one.name))
 
 
 def _decide(
@@ -78,11 +84,22 @@ def _decide(
     agreeing: Mapping[Pair, float],
     witnesses: Witnesses,
     progress: ProgressBar,
-) -> Verdicts:
-    """Decide which poses are wrong; parts that contradict the rest of the map are tried by the rest."""
+) -> tuple[Verdicts, tuple[Misplaced, ...]]:
+    """Decide which poses are wrong, by images that are not misplaced themselves.
+
+    Parts that contradict the rest of the map are tried by the rest.
+    """
     threads = find_threads(witnesses.names, matches, agreeing, ())
-    parts = [one.part for one in threads if one.contradicted]
-    return Court(witnesses, map.box, progress).decide(parts)
+    court = Court(witnesses, map.box, progress)
+    verdicts = court.decide([one.part for one in threads if one.contradicted])
+    if _has_given_poses(map):
+        return verdicts, ()
+    names = witnesses.names
+    misplaced = find_misplaced(map, matches, agreeing, {names[i] for i in verdicts.wrong}, progress)
+    if misplaced and verdicts.wrong:
+        verdicts = court.reconsider(verdicts, [names.index(one.name) for one in misplaced])
+        misplaced = find_misplaced(map, matches, agreeing, {names[i] for i in verdicts.wrong}, progress)
+    return verdicts, misplaced
 
 
 def check_is_full(map: Map) -> None:
@@ -150,11 +167,16 @@ def _wrong(map: Map, name: str, trial: Trial) -> WrongPose:
     )
 
 
+def _has_given_poses(map: Map) -> bool:
+    """Whether poses were given, which are believed more than matches of what looks alike."""
+    quality = map.info.quality
+    return quality is not None and "given" in quality.focal_origins.values()
+
+
 def _contradicted_pairs(
     map: Map, matches: Matches, agreeing: Mapping[Pair, float], wrong: Collection[str]
 ) -> tuple[ContradictedPair, ...]:
-    quality = map.info.quality
-    if quality is not None and "given" in quality.focal_origins.values():
+    if _has_given_poses(map):
         return ()
     left = {pair: matches[pair] for pair in agreeing if not set(pair) & set(wrong)}
     return tuple(
@@ -164,8 +186,10 @@ def _contradicted_pairs(
     )
 
 
-def _unlocalized(witnesses: Witnesses, verdicts: Verdicts) -> tuple[Unlocalized, ...]:
-    alone = [i for i, one in enumerate(verdicts.trials) if not one.testimonies and i not in verdicts.wrong]
+def _unlocalized(witnesses: Witnesses, verdicts: Verdicts, wrong: Collection[str]) -> tuple[Unlocalized, ...]:
+    alone = [
+        i for i, one in enumerate(verdicts.trials) if not one.testimonies and witnesses.names[i] not in wrong
+    ]
     return tuple(
         Unlocalized(
             name=witnesses.names[i],

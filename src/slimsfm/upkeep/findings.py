@@ -54,6 +54,36 @@ class WrongPose:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Misplaced:
+    """An image that does not match what it should see: it was laid over a place that looks alike."""
+
+    name: str
+    """Name of the image."""
+
+    expected: int
+    """Number of points, by pair of images, that it should see of the images around it that are right."""
+
+    seen: int
+    """Number of these that it matches."""
+
+    matches: int
+    """Number of its matches with these images."""
+
+    agreeing: float
+    """Share of the matches that agree with the map."""
+
+    @property
+    def sentence(self) -> str:
+        """The finding in words."""
+        if not self.expected:
+            return f"{self.name}: is confirmed only by images that contradict the others"
+        return (
+            f"{self.name}: matches {self.seen / self.expected:.0%} of what it should see of the images "
+            f"around it; {1 - self.agreeing:.0%} of its {self.matches} matches with them contradict the map"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Unlocalized:
     """An image that no set of the others localizes: nothing supports its pose, and nothing contradicts it."""
 
@@ -204,7 +234,11 @@ class MapCheck:
     """Median relative corner error between the poses of the map and those by the other images."""
 
     wrong: tuple[WrongPose, ...]
-    """Images whose poses are wrong, by name."""
+    """Images whose poses are wrong, and where the others say that they stand, by name."""
+
+    misplaced: tuple[Misplaced, ...]
+    """Others with wrong poses, by name: they were laid over a place that looks alike. Not looked for where
+    poses were given."""
 
     contradicted_pairs: tuple[ContradictedPair, ...]
     """Other pairs of images that are hard to doubt (`mapping.support`) and contradict the map. Not looked for
@@ -225,12 +259,12 @@ class MapCheck:
     @property
     def is_contradicted(self) -> bool:
         """Whether anything contradicts poses of the map."""
-        return bool(self.wrong or self.contradicted_pairs)
+        return bool(self.wrong or self.misplaced or self.contradicted_pairs)
 
     @property
     def wrong_names(self) -> tuple[str, ...]:
-        """Names of the images whose poses are wrong."""
-        return tuple(one.name for one in self.wrong)
+        """Names of the images whose poses are wrong, sorted."""
+        return tuple(sorted(one.name for one in (*self.wrong, *self.misplaced)))
 
 
 def listed(names: tuple[str, ...]) -> str:

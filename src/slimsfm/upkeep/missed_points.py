@@ -66,14 +66,21 @@ def count_misses(map: Map, progress: ProgressBar = silent) -> PointCounts:
 
 def _expected(map: Map, name: str, neighbors: list[str]) -> Ids:
     """Points in an image that neighbors see from nearly the same direction and distance."""
+    found = [points_in_view(map, name, other) for other in neighbors]
+    return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+
+
+def points_in_view(map: Map, name: str, other: str) -> Ids:
+    """Rows of the points of another image that an image should see: in view, and looked at alike by both.
+
+    Both look from directions that differ by at most 15 degrees, and from distances of a ratio up to 1.3, so
+    that nothing hides them from the one alone.
+    """
     image, camera = map.images[name], map.camera(name)
-    here, found = image.projection_center(), []
-    for other in neighbors:
-        points = np.unique(map.observations[other].points)
-        places = map.points3D_in_world[points]
-        alike = _looks_alike(here - places, map.images[other].projection_center() - places)
-        found.append(points[alike])
-    rows = np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
+    here, there = image.projection_center(), map.images[other].projection_center()
+    rows = np.unique(map.observations[other].points)
+    places = map.points3D_in_world[rows]
+    rows = rows[_looks_alike(here - places, there - places)]
     pixels = project(map.points3D_in_world[rows], image.cam_from_world(), camera)
     size = np.array([camera.width, camera.height])
     return rows[np.all((pixels >= _BORDER * size) & (pixels <= (1 - _BORDER) * size), axis=1)]

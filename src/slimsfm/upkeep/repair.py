@@ -8,7 +8,7 @@ from slimsfm.mapping.pairs import Matches
 from slimsfm.mapping.subset import keep_images
 from slimsfm.mapping.support import measure
 from slimsfm.progress import ProgressBar, silent, single_step
-from slimsfm.upkeep.checking import check_is_full, matches_of
+from slimsfm.upkeep.checking import check_is_full, matches_of, wrong_poses
 from slimsfm.upkeep.extension import NewImage, extend_map
 from slimsfm.upkeep.findings import MapCheck, WrongPose, listed
 
@@ -39,7 +39,8 @@ def repair(map: Map, found: MapCheck, *, progress: ProgressBar = silent) -> Repa
     others see. Each then gets the pose by the others, its matches are triangulated, and its pose is adjusted,
     while all other images and points stay as they are, bit for bit. An image is dropped if fewer than two
     disjoint sets of references agree where it stands, if the predicted error is above 0.05 of the diagonal,
-    or if it observes fewer than 15 points in the end.
+    if it observes fewer than 15 points in the end, or if a check finds it wrong there too. So are misplaced
+    images, which no others localize elsewhere.
 
     Args:
         map: The map.
@@ -53,7 +54,7 @@ def repair(map: Map, found: MapCheck, *, progress: ProgressBar = silent) -> Repa
     check_is_full(map)
     if unknown := set(found.wrong_names) - map.images.keys():
         raise ValueError(f"found must be of this map, which has no image {min(unknown)!r}")
-    if not found.wrong:
+    if not found.wrong_names:
         return Repaired(map=map, moved=(), dropped=())
     right = [name for name in map.images if name not in found.wrong_names]
     if len(right) < _FEWEST:
@@ -63,13 +64,20 @@ def repair(map: Map, found: MapCheck, *, progress: ProgressBar = silent) -> Repa
     sure = [one for one in found.wrong if _is_sure(one)]
     with single_step(progress, "register images again"):
         extended = _registered(map, kept, sure, matches) if sure else kept
-    seen = extended.observations
-    moved = tuple(one.name for one in sure if len(seen[one.name].rows) >= _MIN_OBSERVATIONS)
+    seen, still = extended.observations, _still_wrong(extended, sure, progress)
+    moved = tuple(
+        one.name for one in sure if len(seen[one.name].rows) >= _MIN_OBSERVATIONS and one.name not in still
+    )
     made = extended
     if len(moved) < len(sure):
         made = keep_images(extended, [*right, *moved], min_track_length=2)
     dropped = tuple(name for name in found.wrong_names if name not in moved)
     return Repaired(map=_described(made, map, moved, dropped), moved=moved, dropped=dropped)
+
+
+def _still_wrong(extended: Map, sure: list[WrongPose], progress: ProgressBar) -> set[str]:
+    """The images that a check finds wrong again where they were set: look-alikes may mislead twice."""
+    return {one.name for one in wrong_poses(extended, progress)} if sure else set()
 
 
 def _is_sure(one: WrongPose) -> bool:

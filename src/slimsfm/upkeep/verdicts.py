@@ -113,6 +113,15 @@ class Court:
             wrong=tuple(sorted(wrong)), trials=tuple(trials[i] for i in numbers), usual=self._usual
         )
 
+    def reconsider(self, verdicts: Verdicts, unreliable: Collection[int]) -> Verdicts:
+        """Try the images with wrong poses again, by images that are neither wrong nor unreliable."""
+        self._witnesses.suspect({*verdicts.wrong, *unreliable})
+        trials = list(verdicts.trials)
+        for i in verdicts.wrong:
+            trials[i] = self._judge(self._hear(i))
+        wrong = tuple(i for i in verdicts.wrong if trials[i].is_contradicted)
+        return Verdicts(wrong=wrong, trials=tuple(trials), usual=verdicts.usual)
+
     def _misplaced(self, part: set[int]) -> set[int]:
         """Those of a part whose poses all others contradict, if these are most of the ones they localize."""
         self._witnesses.suspect(part)
