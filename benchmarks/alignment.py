@@ -14,6 +14,7 @@ Prints a Markdown table. Rendered photos and their map are kept in the output fo
 
 import argparse
 from collections.abc import Mapping
+from math import erf
 from pathlib import Path
 
 import cv2
@@ -155,10 +156,13 @@ def by_gps(map_: Map, truth: Truth) -> None:
         errors.append(abs(np.degrees(2 * np.arctan2(z, abs(w)))))
         bounds.append(found.heading_bound_deg)
         residuals.append(found.median_residual)
+    least = np.degrees(NOISE / np.linalg.norm(there[:, :2] - there[:, :2].mean(axis=0)))
     print(
         f"| {len(names)} GPS positions with errors of {NOISE:g} m on a ring of {RADIUS:g} m, {DRAWS} draws "
         f"({refused} refused) | heading | median {np.median(errors):.2f}°, "
         f"{100 * np.mean(np.array(errors) < 2):.0f} % below 2°, largest {max(errors):.2f}° "
+        f"(no estimate has a standard deviation below {least:.2f}°: median {0.674 * least:.2f}°, "
+        f"{100 * erf(2 / least / np.sqrt(2)):.0f} % below 2°) "
         f"| {np.median(bounds):.1f}° | {np.median(residuals):.1f} m |"
     )
 

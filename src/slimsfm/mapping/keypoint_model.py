@@ -1,10 +1,14 @@
 """Build a model from keypoints: match, reconstruct."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import pycolmap
+
 from slimsfm.errors import ReconstructionError
+from slimsfm.exif import read_orientation
 from slimsfm.features import Extractor, Features, load_matcher, runs_on_one_core
 from slimsfm.mapping.choice import PickedModel, pick_model
 from slimsfm.mapping.diagnosis import diagnose
@@ -13,9 +17,11 @@ from slimsfm.mapping.known_model import triangulate_known
 from slimsfm.mapping.matching import PairMatching, match_and_verify
 from slimsfm.mapping.orientation import TurnedFeatures, turned_model
 from slimsfm.mapping.pairs import choose_pairs, unsure_pairs
+from slimsfm.mapping.principal_point import with_principal_points
 from slimsfm.mapping.reconstruction import reconstruct
 from slimsfm.mapping.scratch import put_keypoints, verified_matches, write_database, write_geometries
 from slimsfm.mapping.shrinking import ShrunkImages
+from slimsfm.mapping.support import measure
 from slimsfm.mapping.work import BuildOptions, BuildWork, MapParts
 from slimsfm.mapping.workspace import DATABASE, FEATURES, SFM
 
@@ -69,13 +75,33 @@ def _reconstruct(work: BuildWork, database: Path, shrunk: ShrunkImages, options:
         raise ReconstructionError(
             f"{work.images}: these {len(names)} photos give no model: {'; '.join(reasons)}"
         ) from error
-    picked = pick_model(models, options.model)
+    picked = _adjusted(pick_model(models, options.model), work, database, options)
     registered = picked.quality.registered
     if registered + len(picked.elsewhere) >= _FEW * len(names):
         return picked
     few = f"the map has only {registered} of {len(names)} photos"
     lacking = "; ".join(filter(None, [few, _lacking(work, database, shrunk)]))
     return replace(picked, notes=(lacking, *picked.notes))
+
+
+def _adjusted(picked: PickedModel, work: BuildWork, database: Path, options: BuildOptions) -> PickedModel:
+    """The model with the principal points that it determines."""
+    cameras = _held_alike(picked.model, work, options)
+    model = with_principal_points(picked.model, cameras, work.progress)
+    if model is picked.model:
+        return picked
+    matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
+    quality = replace(measure(model, matches, work.names), ambiguous=picked.quality.ambiguous)
+    return replace(picked, model=model, quality=quality)
+
+
+def _held_alike(model: pycolmap.Reconstruction, work: BuildWork, options: BuildOptions) -> set[int]:
+    """Ids of the cameras whose pictures were turned upright from one and the same orientation."""
+    orientations: dict[int, set[tuple[bool, int]]] = defaultdict(set)
+    for image in (model.image(image_id) for image_id in model.reg_image_ids()):
+        tag = read_orientation(work.images / image.name) if options.orientation == "upright" else 1
+        orientations[image.camera_id].add((image.name in work.turned, tag))
+    return {camera_id for camera_id, found in orientations.items() if len(found) == 1}
 
 
 def _lacking(work: BuildWork, database: Path, shrunk: ShrunkImages) -> str:

@@ -3,7 +3,7 @@
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -173,16 +173,29 @@ def _name_images(model: pycolmap.Reconstruction, names: list[str]) -> None:
         image.name = names[image_id - 1]
 
 
-def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
-    """Adjust all poses, points and cameras of a model on one thread, without a word."""
+def adjust(
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    *,
+    constant_cameras: Iterable[int] = (),
+) -> pycolmap.CeresBundleAdjuster:
+    """Adjust all poses, points and cameras of a model, but those given, on one thread, without a word.
+
+    Returns:
+        The solved problem.
+    """
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
+    for camera_id in constant_cameras:
+        config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     with threadpool_limits(1):  # results must not depend on the number of threads
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+        adjuster.solve()
+    return adjuster
 
 
 def triangulate(
