@@ -13,6 +13,7 @@ from slimsfm.geometry import corner_error
 from slimsfm.mapping.io import read_map, write_map
 from slimsfm.mapping.map import check_map
 from slimsfm.mapping.subset import keep_images
+from slimsfm.mapping.support import measure
 from slimsfm.upkeep.merge import merge
 from slimsfm.upkeep.transform import transformed
 
@@ -51,6 +52,19 @@ def test_halves_that_share_images_give_the_whole(full, halves, merged):
         assert corner_error(merged.map.images[name].cam_from_world(), image.cam_from_world(), full.box) < 1e-6
     assert set(halves[0].matches) | set(halves[1].matches) <= set(merged.map.matches)
     assert merged.map.info.origin.startswith("merged from")
+
+
+def test_known_poses_stay_known(halves):
+    """Poses that were given are believed more than matches of what looks alike, also in the merged map."""
+    known = []
+    for half in halves:
+        quality = measure(half.model, half.matches, half.images)
+        origins = dict.fromkeys(quality.focal_lengths, "given")
+        known.append(replace(half, info=replace(half.info, quality=quality.with_origins(origins))))
+    quality = merge(*known).map.info.quality
+    assert quality.has_known_poses
+    assert set(quality.focal_origins.values()) == {"given"}
+    assert (quality.given, quality.registered) == (12, 12)
 
 
 def test_no_point_is_there_twice(merged):

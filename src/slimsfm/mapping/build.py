@@ -1,7 +1,6 @@
 """Build maps from photos by Structure from Motion."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -167,8 +166,6 @@ def _map(
     """The map of a model, without global descriptors."""
     names, picked = work.names, parts.picked
     quality = picked.quality if picked else measure(parts.model, parts.matches, names)
-    if work.known:  # a known pose is believed more than look-alike matches
-        quality = replace(quality, contradictions={}, doubtful=())
     used = {parts.model.image(image_id).name for image_id in parts.model.reg_image_ids()}
     used |= picked.elsewhere if picked else set()
     info = MapInfo(
@@ -178,7 +175,7 @@ def _map(
         box_source="given" if given_box else "estimated",
         unit=work.known.unit if work.known else "unknown",
         origin=f"built from {len(names)} images" + (" with known poses" if work.known else ""),
-        quality=replace(quality, focal_origins=_origins(quality, work)),
+        quality=quality.with_origins(_origins(quality, work)),
         notes=notes,
         orientation=options.orientation,
         exif_orientations=_exif_orientations(work, exifs) if options.orientation == "upright" else {},

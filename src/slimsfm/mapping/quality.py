@@ -1,6 +1,7 @@
 """The quality of a model: what supports it, and what contradicts it."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slimsfm.files import plain
@@ -69,6 +70,17 @@ class ModelQuality:
     """Number of images of each piece of the model, largest first; more than one is a fault."""
 
     @property
+    def has_known_poses(self) -> bool:
+        """Whether poses were given, which are believed more than matches of what looks alike."""
+        return "given" in self.focal_origins.values()
+
+    def with_origins(self, origins: Mapping[str, str]) -> "ModelQuality":
+        """With the first guesses of focal lengths, by name of image; known poses are not contradicted."""
+        found = {name: origins[name] for name in self.focal_lengths if name in origins}
+        described = replace(self, focal_origins=found)
+        return replace(described, contradictions={}, doubtful=()) if described.has_known_poses else described
+
+    @property
     def contradicted_share(self) -> float:
         """Share of the images that belong to a contradicted trusted pair."""
         return len(self.contradictions) / max(self.registered, 1)
@@ -125,7 +137,7 @@ class ModelQuality:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Doubts, and the faults that an imported model may have. Known poses do not depend on points."""
-        faults = () if "given" in self.focal_origins.values() else self.faults
+        faults = () if self.has_known_poses else self.faults
         return (*self.doubts, *(f"the model may be wrong: {fault}" for fault in faults))
 
 

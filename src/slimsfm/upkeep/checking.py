@@ -92,7 +92,7 @@ def _decide(
     threads = find_threads(witnesses.names, matches, agreeing, ())
     court = Court(witnesses, map.box, progress)
     verdicts = court.decide([one.part for one in threads if one.contradicted])
-    if _has_given_poses(map):
+    if _has_known_poses(map):
         return verdicts, ()
     names = witnesses.names
     misplaced = find_misplaced(map, matches, agreeing, {names[i] for i in verdicts.wrong}, progress)
@@ -167,16 +167,14 @@ def _wrong(map: Map, name: str, trial: Trial) -> WrongPose:
     )
 
 
-def _has_given_poses(map: Map) -> bool:
-    """Whether poses were given, which are believed more than matches of what looks alike."""
-    quality = map.info.quality
-    return quality is not None and "given" in quality.focal_origins.values()
+def _has_known_poses(map: Map) -> bool:
+    return map.info.quality is not None and map.info.quality.has_known_poses
 
 
 def _contradicted_pairs(
     map: Map, matches: Matches, agreeing: Mapping[Pair, float], wrong: Collection[str]
 ) -> tuple[ContradictedPair, ...]:
-    if _has_given_poses(map):
+    if _has_known_poses(map):
         return ()
     left = {pair: matches[pair] for pair in agreeing if not set(pair) & set(wrong)}
     return tuple(

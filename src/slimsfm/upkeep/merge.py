@@ -198,10 +198,25 @@ def _merged(
         global_descriptors=None,
         info=_info(target, source, model, names, cameras),
     )
-    if target.info.quality is None and source.info.quality is None:
+    qualities = [one.info.quality for one in (target, source) if one.info.quality]
+    if not qualities:
         return merged
-    quality = measure(model, matches, list(merged.images))
+    lost = sum(one.given - one.registered for one in qualities)
+    origins = {**_focal_origins(source, names), **_focal_origins(target, {})}
+    quality = measure(model, matches, list(merged.images)).with_origins(origins)
+    quality = replace(quality, given=quality.given + lost)
     return replace(merged, info=replace(merged.info, quality=quality))
+
+
+def _focal_origins(map: Map, names: Mapping[str, str]) -> dict[str, str]:
+    """First guess of the focal length of each image, by its new name."""
+    known = map.info.quality.focal_origins if map.info.quality else {}
+    of_camera = {map.images[name].camera_id: origin for name, origin in known.items() if name in map.images}
+    return {
+        names.get(name, name): of_camera[image.camera_id]
+        for name, image in map.images.items()
+        if image.camera_id in of_camera
+    }
 
 
 def _renamed(source: Map, names: Mapping[str, str]) -> dict[tuple[str, str], IndexPairs]:

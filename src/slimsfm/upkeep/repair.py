@@ -109,8 +109,6 @@ def _described(made: Map, map: Map, moved: tuple[str, ...], dropped: tuple[str, 
     before = map.info.quality
     quality = measure(made.model, made.matches, [*made.images, *dropped])
     if before is not None:
-        quality = replace(quality, given=before.given, focal_origins=before.focal_origins)
-        if "given" in before.focal_origins.values():  # a known pose is believed more than look-alike matches
-            quality = replace(quality, contradictions={}, doubtful=())
+        quality = replace(quality, given=before.given).with_origins(before.focal_origins)
     wrong = tuple(name for name in map.info.wrong_poses if name not in (*moved, *dropped))
     return replace(made, info=replace(map.info, notes=tuple(notes), quality=quality, wrong_poses=wrong))
