@@ -60,6 +60,9 @@ def main() -> None:
     truth = {f"{k:03}.png": pose.inverse().translation for k, pose in enumerate(take.cam_from_object)}
     by_tag(built, truth, arguments.output / "photos")
     by_gps(built, truth)
+    if arguments.map:
+        print_camera(read_map(arguments.map), "the photos")
+    print_camera(built, "the rendered photos")
 
 
 def positions_of(transforms: Path) -> Truth:
@@ -76,6 +79,16 @@ def exact(map_: Map, truth: Truth) -> pycolmap.Sim3d:
     if found is None:
         raise InputError("the true positions do not determine a similarity")
     return found
+
+
+def print_camera(map_: Map, what: str) -> None:
+    """Print the focal length and the principal point of the first camera."""
+    camera = map_.camera(next(iter(map_.images)))
+    point = f"{camera.principal_point_x:.1f}, {camera.principal_point_y:.1f}"
+    print(
+        f"camera of {what}: focal length {camera.mean_focal_length():.1f}, principal point {point}",
+        flush=True,
+    )
 
 
 def by_positions(map_: Map, truth: Truth) -> None:

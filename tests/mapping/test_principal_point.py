@@ -3,6 +3,8 @@ import pycolmap
 import pytest
 
 from slimsfm.geometry import project
+from slimsfm.mapping import principal_point as principal_point_module
+from slimsfm.mapping.model import positions
 from slimsfm.mapping.principal_point import with_principal_points
 from slimsfm.synthetic.scene import look_at
 
@@ -53,13 +55,47 @@ def test_a_principal_point_that_the_images_determine_is_found_and_the_given_mode
     assert principal_point(model) == (320, 240)
 
 
+def test_images_without_poses_do_no_harm(model):
+    """As they are left where a model fell into pieces."""
+    some = pycolmap.Reconstruction(model)
+    some.deregister_frame(some.image(3).frame_id)
+    adjusted = with_principal_points(some, {1})
+    assert principal_point(adjusted) == pytest.approx(OFF, abs=0.01)
+    assert adjusted.num_reg_images() == 19
+
+
+def test_a_part_of_many_images_decides_for_all_of_them(model, monkeypatch):
+    monkeypatch.setattr(principal_point_module, "_MOST_JUDGED", 15)
+    adjusted = with_principal_points(model, {1})
+    assert adjusted.num_reg_images() == 20
+    assert principal_point(adjusted) == pytest.approx(OFF, abs=0.01)
+
+
 def test_equal_models_give_equal_bytes(model):
     one, other = (with_principal_points(model, {1}) for _ in range(2))
     assert one.cameras[1].params.tobytes() == other.cameras[1].params.tobytes()
 
 
-def test_other_cameras_stay_as_they_are(model):
+def test_cameras_that_were_not_held_alike_keep_the_center(model):
     assert with_principal_points(model, set()) is model
+
+
+def test_a_camera_of_few_images_keeps_the_center_beside_one_of_many(model):
+    two = pycolmap.Reconstruction(model)
+    other = pycolmap.Camera(two.cameras[1].todict())
+    other.camera_id = 2
+    two.add_camera_with_trivial_rig(other)
+    for image_id in range(1, 6):
+        copy = two.image(image_id)
+        lone = pycolmap.Image(
+            name=f"lone{image_id}.png", keypoints=positions(copy), camera_id=2, image_id=100 + image_id
+        )
+        two.add_image_with_trivial_frame(lone, copy.cam_from_world())
+        for row, point_id in enumerate(sorted(two.point3D_ids())):
+            two.add_observation(point_id, pycolmap.TrackElement(100 + image_id, row))
+    adjusted = with_principal_points(two, {1, 2})
+    assert adjusted.cameras[2].principal_point_x == 320
+    assert abs(adjusted.cameras[1].principal_point_x - OFF[0]) < 2
 
 
 def test_few_images_determine_nothing():

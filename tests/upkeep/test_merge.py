@@ -54,17 +54,32 @@ def test_halves_that_share_images_give_the_whole(full, halves, merged):
     assert merged.map.info.origin.startswith("merged from")
 
 
-def test_known_poses_stay_known(halves):
-    """Poses that were given are believed more than matches of what looks alike, also in the merged map."""
-    known = []
-    for half in halves:
-        quality = measure(half.model, half.matches, half.images)
-        origins = dict.fromkeys(quality.focal_lengths, "given")
-        known.append(replace(half, info=replace(half.info, quality=quality.with_origins(origins))))
-    quality = merge(*known).map.info.quality
-    assert quality.has_known_poses
-    assert set(quality.focal_origins.values()) == {"given"}
-    assert (quality.given, quality.registered) == (12, 12)
+def with_origin(map_, origin):
+    """The map with a quality, whose focal lengths have an origin."""
+    quality = measure(map_.model, map_.matches, map_.images)
+    origins = dict.fromkeys(quality.focal_lengths, origin)
+    return replace(map_, info=replace(map_.info, quality=quality.with_origins(origins)))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "known"),
+    [("given", "given", True), ("given", "EXIF", True), ("EXIF", "given", False), ("EXIF", "EXIF", False)],
+)
+def test_poses_are_known_if_those_are_whose_frame_is_kept(halves, first, second, known):
+    """Known poses are believed more than matches of what looks alike."""
+    made = merge(with_origin(halves[0], first), with_origin(halves[1], second)).map
+    assert made.info.quality.has_known_poses == known
+    assert set(made.info.quality.focal_origins.values()) == {first}
+
+
+def test_photos_that_neither_map_has_are_counted_once(halves, full):
+    lacking = [
+        replace(with_origin(half, "EXIF"), unregistered=(*(full.images.keys() - half.images.keys()), "x.png"))
+        for half in halves
+    ]
+    made = merge(*lacking).map
+    assert made.unregistered == ("x.png",)
+    assert (made.info.quality.given, made.info.quality.registered) == (13, 12)
 
 
 def test_no_point_is_there_twice(merged):

@@ -3,12 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slimsfm.mapping.subset import keep_images
 from slimsfm.mapping.support import agreement, measure
+from slimsfm.progress import silent
+from slimsfm.upkeep import misplaced as module
 from slimsfm.upkeep.checking import check, wrong_poses
+from slimsfm.upkeep.findings import Misplaced
 from slimsfm.upkeep.misplaced import find_misplaced
 from slimsfm.upkeep.repair import repair
-from wrong_poses import laid_over, matched_map
+from wrong_poses import laid_over, matched_map, turned
 
 PART = tuple(f"{number:03d}.png" for number in range(25, 32))
 """Images that are laid over those on the other side."""
@@ -48,14 +50,27 @@ def test_an_image_that_something_hides_from_the_others_is_not_misplaced(right):
     assert misplaced(replace(right, matches=thin)) == ()
 
 
-def test_a_part_beside_all_others_is_misplaced_if_its_matches_with_them_contradict_the_map(right):
-    free = [f"{number:03d}.png" for number in range(5, 16)]  # where the part is moved to
-    gap = keep_images(right, [name for name in right.images if name not in free], min_track_length=2)
-    gap = replace(
-        gap, matches={pair: right.matches[pair] for pair in right.matches if not set(pair) & set(free)}
-    )
-    assert misplaced(gap) == ()
-    assert misplaced(laid_over(gap, PART, 180)) == PART
+def test_few_images_with_look_alike_matches_are_right():
+    """Images of wide steps should see nothing in common from nearly the same place."""
+    few = matched_map(12, 200)
+    rows = np.stack([np.arange(20)] * 2, axis=1)
+    assert misplaced(replace(few, matches={**few.matches, ("001.png", "007.png"): rows})) == ()
+
+
+def test_parts_are_cut_where_the_sums_over_all_pairs_say(folded):
+    """What the tree adds up for its edges are the sums over the pairs that an edge separates."""
+    agreeing = agreement(folded.images, folded.matches)
+    pairs = module._pairs(folded, folded.matches, agreeing, silent)
+    kept = np.ones(len(folded.images), bool)
+    kept[3] = False
+    tree = module._spanning_tree(pairs, kept)
+    across = module._across(pairs, kept, tree)
+    assert len(tree.order) > 30
+    for top, sums in zip(tree.order, across, strict=True):
+        side = np.isin(np.arange(len(kept)), list(tree.smaller_side(top)))
+        a, b = pairs.images.T
+        separated = side[a] & ~side[b] & kept[b]
+        np.testing.assert_allclose(sums, [weight[separated].sum() for weight in pairs.weights], atol=1e-6)
 
 
 def test_a_check_names_all_images_of_a_fold_and_a_repair_leaves_a_right_map(folded):
@@ -86,3 +101,23 @@ def test_given_poses_are_believed_more_than_matches(folded):
     quality = measure(folded.model, folded.matches, folded.images)
     given = replace(quality, focal_origins={"001.png": "given"})
     assert not check(replace(folded, info=replace(folded.info, quality=given))).misplaced
+
+
+def test_known_poses_stay_known_when_the_first_image_is_dropped(right):
+    few = replace(right, matches={p: rows for p, rows in right.matches.items() if "001.png" not in p})
+    few = replace(few, matches={**few.matches, ("001.png", "002.png"): right.matches["001.png", "002.png"]})
+    quality = measure(few.model, few.matches, few.images).with_origins({"001.png": "given"})
+    wrong = turned(replace(few, info=replace(few.info, quality=quality)), "001.png", 60)
+    repaired = repair(wrong, check(wrong))
+    assert repaired.dropped == ("001.png",)
+    assert repaired.map.info.quality.has_known_poses
+
+
+def test_references_that_are_misplaced_set_nothing_right(right):
+    wrong = turned(right, "004.png", 30)
+    found = check(wrong)
+    unreliable = found.wrong[0].sets[0][0]
+    misled = replace(
+        found, misplaced=(Misplaced(name=unreliable, expected=1, seen=0, matches=1, agreeing=0.0),)
+    )
+    assert repair(wrong, misled).dropped == tuple(sorted(["004.png", unreliable]))

@@ -48,9 +48,7 @@ def with_right_poses(sequences: ObjectSequences, progress: ProgressBar = silent)
             f"{sequences.name}: the poses of {len(wrong)} of {len(truth.images)} images are contradicted, "
             "which leaves too few to measure with; `slimsfm check` names them"
         )
-    _LOGGER.warning(
-        "%s: left out, because the other images contradict their poses: %s", sequences.name, ", ".join(wrong)
-    )
+    _LOGGER.warning("%s: left out, because their own poses are wrong: %s", sequences.name, ", ".join(wrong))
     right = [name for name in truth.images if name not in wrong]
     kept = keep_images(truth, right, min_track_length=TWO_VIEWS)
     return RightSequences(

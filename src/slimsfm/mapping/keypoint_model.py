@@ -85,18 +85,20 @@ def _reconstruct(work: BuildWork, database: Path, shrunk: ShrunkImages, options:
 
 
 def _adjusted(picked: PickedModel, work: BuildWork, database: Path, options: BuildOptions) -> PickedModel:
-    """The model with the principal points that it determines."""
+    """The model with the principal points that it determines, unless matches then contradict more of it."""
     cameras = _held_alike(picked.model, work, options)
     model = with_principal_points(picked.model, cameras, work.progress)
     if model is picked.model:
         return picked
     matches = verified_matches(database, {i: model.image(i).name for i in model.reg_image_ids()})
     quality = replace(measure(model, matches, work.names), ambiguous=picked.quality.ambiguous)
+    if len(quality.contradictions) > len(picked.quality.contradictions) or quality.faults:
+        return picked
     return replace(picked, model=model, quality=quality)
 
 
 def _held_alike(model: pycolmap.Reconstruction, work: BuildWork, options: BuildOptions) -> set[int]:
-    """Ids of the cameras whose pictures were turned upright from one and the same orientation."""
+    """Ids of the cameras that were held the same way for all of their photos."""
     orientations: dict[int, set[tuple[bool, int]]] = defaultdict(set)
     for image in (model.image(image_id) for image_id in model.reg_image_ids()):
         tag = read_orientation(work.images / image.name) if options.orientation == "upright" else 1

@@ -6,19 +6,24 @@ up for it. Many photos that show the same things from different sides do determi
 """
 
 from collections import Counter
-from collections.abc import Set
+from collections.abc import Sequence, Set
 
 import numpy as np
 import pycolmap
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order
 
-from slimsfm.arrays import evenly_spaced
 from slimsfm.lenses import camera_fault
+from slimsfm.mapping.model import positions
+from slimsfm.mapping.quality import MIN_COMMON_POINTS
 from slimsfm.mapping.sfm import adjust
+from slimsfm.mapping.support import common_points
 from slimsfm.progress import ProgressBar, silent, single_step
 
 _MAX_STD = 2e-3  # of a principal point that counts as determined, over the longer side of the image
 _FEWEST = 10  # images of a camera
 _MOST_JUDGED = 200  # images by which it is decided
+_TWO_VIEWS = 2  # of a point
 
 
 def with_principal_points(
@@ -27,8 +32,8 @@ def with_principal_points(
     """Adjust a model with the principal points of those cameras that it determines.
 
     A principal point is determined if its camera took ten of the images, and if the standard deviation of
-    both of its coordinates, for errors of one pixel, is at most 0.2 % of the longer side. At most 200
-    images are asked.
+    both of its coordinates, for errors of one pixel, is at most 0.2 % of the longer side. Of large models,
+    200 images decide: those that are linked most directly to the image that sees the most points.
 
     Args:
         model: The model; it is not changed.
@@ -39,7 +44,7 @@ def with_principal_points(
     Returns:
         The adjusted model, or the given one if it determines none.
     """
-    judged = _with_fewer_images(model)
+    judged = _of_images(model, _linked_images(model))
     counts = Counter(judged.image(i).camera_id for i in judged.reg_image_ids())
     cameras = {camera_id for camera_id in cameras if counts[camera_id] >= _FEWEST}
     if not cameras:
@@ -65,11 +70,36 @@ def _adjusted(
     return adjusted
 
 
-def _with_fewer_images(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    copy, image_ids = pycolmap.Reconstruction(model), sorted(model.reg_image_ids())
-    kept = {image_ids[place] for place in evenly_spaced(len(image_ids), _MOST_JUDGED)}
-    for image_id in sorted(set(image_ids) - kept):
-        copy.deregister_frame(copy.image(image_id).frame_id)
+def _linked_images(model: pycolmap.Reconstruction) -> list[int]:
+    """Ids of the images that decide."""
+    image_ids = sorted(model.reg_image_ids())
+    if len(image_ids) <= _MOST_JUDGED:
+        return image_ids
+    common = common_points(model, [model.image(image_id).name for image_id in image_ids])
+    start = int(np.argmax(common.diagonal()))
+    links = csr_array(common >= MIN_COMMON_POINTS)
+    nearest = breadth_first_order(links, start, directed=False, return_predecessors=False)
+    return sorted(image_ids[place] for place in nearest[:_MOST_JUDGED].tolist())
+
+
+def _of_images(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> pycolmap.Reconstruction:
+    """A copy with some of the posed images, and the points that two of them see."""
+    copy = pycolmap.Reconstruction()
+    for camera_id in sorted({model.image(image_id).camera_id for image_id in image_ids}):
+        copy.add_camera_with_trivial_rig(model.camera(camera_id))
+    for image_id in image_ids:
+        image = model.image(image_id)
+        own = pycolmap.Image(
+            name=image.name, keypoints=positions(image), camera_id=image.camera_id, image_id=image_id
+        )
+        copy.add_image_with_trivial_frame(own, image.cam_from_world())
+    for point_id in sorted(model.point3D_ids()):
+        point = model.point3D(point_id)
+        track = [one for one in point.track.elements if one.image_id in copy.images]
+        if len(track) >= _TWO_VIEWS:
+            kept = pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error)
+            kept.track = pycolmap.Track(track)
+            copy.add_point3D_with_id(point_id, kept)
     return copy
 
 

@@ -55,7 +55,7 @@ def measure(model: pycolmap.Reconstruction, matches: Matches, names: Iterable[st
     images = {model.image(i).name: model.image(i) for i in sorted(model.reg_image_ids())}
     agreeing = agreement(images, matches)
     trusted = trusted_pairs(matches, names)
-    common = _common_points(model, list(images))
+    common = common_points(model, list(images))
     broken = {pair: agreeing[pair] for pair in trusted if agreeing.get(pair, 1.0) < MIN_AGREEING}
     contradictions = {
         name: min(broken[p] for p in broken if name in p) for name in sorted({*sum(broken, ())})
@@ -149,8 +149,8 @@ def trusted_pairs(matches: Matches, names: Iterable[str]) -> set[Pair]:
     return trusted
 
 
-def _common_points(model: pycolmap.Reconstruction, names: list[str]) -> csr_array:
-    """Number of points that two images see, of shape [images, images]."""
+def common_points(model: pycolmap.Reconstruction, names: list[str]) -> csr_array:
+    """Number of points that two of some posed images see, of shape [images, images]."""
     rows = {model_id: names.index(model.image(model_id).name) for model_id in model.reg_image_ids()}
     seen = {
         (rows[element.image_id], column)
@@ -174,7 +174,7 @@ def pieces_of(model: pycolmap.Reconstruction, *, min_images: int) -> list[pycolm
     if len(image_ids) < min_images or not model.num_points3D():
         return []
     names = [model.image(i).name for i in image_ids]
-    _, labels = connected_components(_common_points(model, names) >= MIN_COMMON_POINTS)
+    _, labels = connected_components(common_points(model, names) >= MIN_COMMON_POINTS)
     counts = Counter(labels.tolist())
     if len(counts) == 1:
         return [model]

@@ -71,7 +71,7 @@ def check(map: Map, *, images: str | Path | None = None, progress: ProgressBar =
 
 
 def wrong_poses(map: Map, progress: ProgressBar = silent) -> tuple[WrongPose | Misplaced, ...]:
-    """The images of a full map whose poses are wrong, by name: what benchmarks need of `check`."""
+    """The images of a full map whose poses are wrong, by name, without the other findings of `check`."""
     matches = matches_of(map, progress)
     agreeing = agreement(map.images, matches)
     verdicts, misplaced = _decide(map, matches, agreeing, Witnesses(map, matches), progress)

@@ -61,7 +61,7 @@ class Misplaced:
     """Name of the image."""
 
     expected: int
-    """Number of points, by pair of images, that it should see of the images around it that are right."""
+    """Points of the images around it that it should see, counted once per image; of those that are right."""
 
     seen: int
     """Number of these that it matches."""
@@ -76,7 +76,7 @@ class Misplaced:
     def sentence(self) -> str:
         """The finding in words."""
         if not self.expected:
-            return f"{self.name}: is confirmed only by images that contradict the others"
+            return f"{self.name}: stands only among images that are misplaced too"
         return (
             f"{self.name}: matches {self.seen / self.expected:.0%} of what it should see of the images "
             f"around it; {1 - self.agreeing:.0%} of its {self.matches} matches with them contradict the map"

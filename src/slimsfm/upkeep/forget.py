@@ -1,6 +1,6 @@
 """Forget points that nothing matches any more and images that others replace, and say what that costs."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from slimsfm.mapping.support import measure
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.add import check_extendable
 from slimsfm.upkeep.missed_points import count_misses
-from slimsfm.upkeep.origins import with_count
+from slimsfm.upkeep.origins import focal_origins, with_count
 
 _TESTS = 16  # images that are left out to measure what is lost
 
@@ -137,23 +137,22 @@ def _without(map: Map, kept: Collection[str], missed: Ids) -> Map:
     old, gone = map.info, len(map.images) - len(smaller.images)
     info = replace(
         old,
-        quality=old.quality and _quality(old.quality, smaller),
+        quality=old.quality and _quality(old.quality, smaller, focal_origins(map)),
         origin=with_count(old.origin, gone, "images forgotten"),
     )
     return replace(smaller, info=info)
 
 
-def _quality(old: ModelQuality, smaller: Map) -> ModelQuality:
+def _quality(old: ModelQuality, smaller: Map, origins: Mapping[str, str]) -> ModelQuality:
     """Quality, measured again; what was said of kept images stays, because they did not move."""
     names = smaller.images
     found = measure(smaller.model, smaller.matches, list(names))
     return replace(
-        found,
+        found.with_origins(origins),
         given=old.given,
         contradictions={name: share for name, share in old.contradictions.items() if name in names},
         doubtful=tuple(name for name in old.doubtful if name in names),
         ambiguous=old.ambiguous,
-        focal_origins={n: old.focal_origins[n] for n in found.focal_lengths if n in old.focal_origins},
     )
 
 

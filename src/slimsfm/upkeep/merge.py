@@ -24,6 +24,7 @@ from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.between_maps import MapSimilarity, similarity_between
 from slimsfm.upkeep.extension import JoinedMapping, NewImage, add_images
 from slimsfm.upkeep.joining import add_points, same_points
+from slimsfm.upkeep.origins import focal_origins
 from slimsfm.upkeep.refinement import Movement, refined
 from slimsfm.upkeep.transform import transformed
 
@@ -196,25 +197,32 @@ def _merged(
         features=JoinedMapping(target.features, added),
         matches=matches,
         global_descriptors=None,
+        unregistered=tuple(
+            sorted(
+                {*target.unregistered, *source.unregistered} - {image.name for image in model.images.values()}
+            )
+        ),
         info=_info(target, source, model, names, cameras),
     )
-    qualities = [one.info.quality for one in (target, source) if one.info.quality]
-    if not qualities:
+    if target.info.quality is None and source.info.quality is None:
         return merged
-    lost = sum(one.given - one.registered for one in qualities)
-    origins = {**_focal_origins(source, names), **_focal_origins(target, {})}
-    quality = measure(model, matches, list(merged.images)).with_origins(origins)
-    quality = replace(quality, given=quality.given + lost)
+    quality = measure(model, matches, list(merged.images)).with_origins(
+        _focal_origins(merged, target, source, names)
+    )
+    quality = replace(quality, given=len(merged.images) + len(merged.unregistered))
     return replace(merged, info=replace(merged.info, quality=quality))
 
 
-def _focal_origins(map: Map, names: Mapping[str, str]) -> dict[str, str]:
-    """First guess of the focal length of each image, by its new name."""
-    known = map.info.quality.focal_origins if map.info.quality else {}
-    of_camera = {map.images[name].camera_id: origin for name, origin in known.items() if name in map.images}
+def _focal_origins(merged: Map, target: Map, source: Map, names: Mapping[str, str]) -> dict[str, str]:
+    """First guess of the focal length of each image. Poses stay known only if those of the target are."""
+    kept, others = focal_origins(target), focal_origins(source)
+    others = {names[name]: origin for name, origin in others.items() if name in names}
+    if "given" not in kept.values():
+        others = {name: "model" if origin == "given" else origin for name, origin in others.items()}
+    of_camera = {merged.images[name].camera_id: origin for name, origin in {**others, **kept}.items()}
     return {
-        names.get(name, name): of_camera[image.camera_id]
-        for name, image in map.images.items()
+        name: of_camera[image.camera_id]
+        for name, image in merged.images.items()
         if image.camera_id in of_camera
     }
 

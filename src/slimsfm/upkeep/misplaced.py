@@ -6,7 +6,7 @@ match few, and many of their matches with these images contradict the map. An im
 match few points, because something hides them, but its matches agree.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import networkx as nx
@@ -40,13 +40,18 @@ class _Pairs:
     """Rows of the images."""
 
     expected: Sums
-    """How many points of the one the other should see, or the reverse, whatever is more."""
+    """How many points of the one the other should see, or the reverse, whichever is more."""
 
     matched: Sums
     """Number of verified matches."""
 
     agreeing: Sums
     """Number of these that agree with the map."""
+
+    @property
+    def weights(self) -> tuple[Sums, Sums, Sums, Sums]:
+        """By pair, what `sums` adds up."""
+        return self.expected, np.minimum(self.expected, self.agreeing), self.matched, self.agreeing
 
     def sums(self, kept: Mask) -> tuple[Sums, Sums, Sums, Sums]:
         """By image, over its pairs with images that are kept.
@@ -56,9 +61,8 @@ class _Pairs:
         """
         inside = kept[self.images[:, 1]]
         rows = self.images[inside, 0]
-        weights = self.expected, np.minimum(self.expected, self.agreeing), self.matched, self.agreeing
         found = np.zeros((4, len(kept)))
-        for total, weight in zip(found, weights, strict=True):
+        for total, weight in zip(found, self.weights, strict=True):
             np.add.at(total, rows, weight[inside])
         return found[0], found[1], found[2], found[3]
 
@@ -74,8 +78,7 @@ def find_misplaced(
 
     The worst image is taken out first, and the others are compared without it. Then parts that confirm
     themselves are compared with the rest: those that match fewer than 20 % of what they should see of it, and
-    of whose matches with it most contradict the map, are misplaced too. So are those that do not match what
-    they should see of any other part, if their other matches with the largest part contradict the map.
+    of whose matches with it most contradict the map, are misplaced too.
 
     Args:
         map: A full map.
@@ -88,7 +91,6 @@ def find_misplaced(
     pairs = _pairs(map, matches, agreeing, progress)
     right = np.array([name not in wrong for name in names])
     kept = _without_parts(pairs, _without_images(pairs, right))
-    kept = _largest_part(names, pairs, kept, matches, agreeing)
     expected, seen, matched, agreed = pairs.sums(kept)
     return tuple(
         Misplaced(
@@ -143,55 +145,61 @@ def _without_parts(pairs: _Pairs, kept: Mask) -> Mask:
     Parts are what an edge of the spanning tree with the most agreeing matches separates from the rest.
     """
     left = kept.copy()
-    while parts := list(_parts(pairs, left)):
-        shares = [_share_across(pairs, part, left) for part in parts]
-        worst = int(np.argmin(shares))
-        if shares[worst] >= _PART_MATCHED:
-            break
-        left &= ~parts[worst]
-    return left
+    while True:
+        tree = _spanning_tree(pairs, left)
+        expected, seen, matched, agreeing = _across(pairs, left, tree).T
+        shares = np.where(agreeing < MIN_AGREEING * matched, seen / np.maximum(expected, 1), np.inf)
+        if not len(shares) or shares.min() >= _PART_MATCHED:
+            return left
+        top = tree.order[int(np.argmin(shares))]
+        left[sorted(tree.smaller_side(top))] = False
 
 
-def _parts(pairs: _Pairs, kept: Mask) -> Iterator[Mask]:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Tree:
+    """Rooted trees that span images; each edge is named by its lower end."""
+
+    graph: nx.DiGraph
+    """Edges from the roots down."""
+
+    order: list[int]
+    """Images that have one above them, those first that come before all below them."""
+
+    def smaller_side(self, top: int) -> set[int]:
+        """The images of the smaller of the two parts that an edge joins."""
+        below = {top, *nx.descendants(self.graph, top)}
+        tree = nx.node_connected_component(self.graph.to_undirected(as_view=True), top)
+        return min(below, tree - below, key=lambda side: (len(side), min(side)))
+
+
+def _spanning_tree(pairs: _Pairs, kept: Mask) -> _Tree:
     inside = kept[pairs.images].all(axis=1)
-    graph = nx.Graph()
-    graph.add_nodes_from(np.flatnonzero(kept).tolist())
+    joined = nx.Graph()
     weights = zip(pairs.images[inside].tolist(), pairs.agreeing[inside].tolist(), strict=True)
-    graph.add_weighted_edges_from((a, b, weight) for (a, b), weight in weights)
-    tree = nx.maximum_spanning_tree(graph)
-    for a, b in sorted(tree.edges):
-        tree.remove_edge(a, b)
-        smaller = min(
-            (nx.node_connected_component(tree, one) for one in (a, b)), key=lambda one: (len(one), min(one))
-        )
-        tree.add_edge(a, b)
-        yield np.isin(np.arange(len(kept)), list(smaller))
+    joined.add_weighted_edges_from((a, b, weight) for (a, b), weight in weights)
+    spanning, rooted = nx.maximum_spanning_tree(joined), nx.DiGraph()
+    for component in sorted(nx.connected_components(spanning), key=min):
+        rooted.add_edges_from(nx.bfs_edges(spanning, min(component)))
+    return _Tree(graph=rooted, order=[below for _, below in rooted.edges])
 
 
-def _share_across(pairs: _Pairs, part: Mask, kept: Mask) -> float:
-    """Share of what a part should see of the rest that it matches; 1 if its matches agree with the map."""
-    first, second = pairs.images.T
-    across = part[first] & kept[second] & ~part[second]
-    expected, seen = pairs.expected[across].sum(), np.minimum(pairs.expected, pairs.agreeing)[across].sum()
-    contradicts = pairs.agreeing[across].sum() < MIN_AGREEING * pairs.matched[across].sum()
-    return float(seen / expected) if contradicts else 1.0
+def _across(pairs: _Pairs, kept: Mask, tree: _Tree) -> Float64[np.ndarray, "edges 4"]:
+    """For each edge of a tree, the sums over the pairs of images that it separates, as of `_Pairs.sums`.
 
-
-def _largest_part(
-    names: list[str], pairs: _Pairs, kept: Mask, matches: Matches, agreeing: Mapping[Pair, float]
-) -> Mask:
-    """Which images are left without the parts that contradict the largest one, whatever they should see."""
-    holds = (pairs.agreeing >= _MATCHED * pairs.expected) & (pairs.agreeing >= MIN_AGREEING * pairs.matched)
-    graph = nx.Graph()
-    graph.add_nodes_from(np.flatnonzero(kept).tolist())
-    graph.add_edges_from(pairs.images[holds & kept[pairs.images].all(axis=1)].tolist())
-    parts = sorted(nx.connected_components(graph), key=lambda part: (-len(part), min(part)))
-    largest = {names[i] for i in parts[0]} if parts else set()
-    left = kept.copy()
-    for part in parts[1:]:
-        own = {names[i] for i in part}
-        across = [p for p in agreeing if len(own & set(p)) == 1 and len(largest & set(p)) == 1]
-        total = sum(len(matches[p]) for p in across)
-        if sum(agreeing[p] * len(matches[p]) for p in across) < _AGREEING * total:
-            left[sorted(part)] = False
-    return left
+    They are the sums of all images below, without the pairs of which both images are below: those that have
+    their lowest common image above them there.
+    """
+    totals = np.stack(pairs.sums(kept), axis=1)
+    inside = kept[pairs.images].all(axis=1) & (pairs.images[:, 0] < pairs.images[:, 1])
+    values = np.stack([weight[inside] for weight in pairs.weights], axis=1)
+    row = {(a, b): place for place, (a, b) in enumerate(pairs.images[inside].tolist())}
+    for root in [node for node, degree in tree.graph.in_degree() if not degree]:
+        below = {root, *nx.descendants(tree.graph, root)}
+        own = [pair for pair in row if pair[0] in below]
+        found = nx.tree_all_pairs_lowest_common_ancestor(tree.graph, root, own)
+        for (a, b), top in found:
+            totals[top] -= 2 * values[row[(a, b) if (a, b) in row else (b, a)]]
+    for below in reversed(tree.order):
+        (above,) = tree.graph.predecessors(below)
+        totals[above] += totals[below]
+    return totals[tree.order]

@@ -74,7 +74,7 @@ def points_in_view(map: Map, name: str, other: str) -> Ids:
     """Rows of the points of another image that an image should see: in view, and looked at alike by both.
 
     Both look from directions that differ by at most 15 degrees, and from distances of a ratio up to 1.3, so
-    that nothing hides them from the one alone.
+    that nothing hides them from only one of them.
     """
     image, camera = map.images[name], map.camera(name)
     here, there = image.projection_center(), map.images[other].projection_center()

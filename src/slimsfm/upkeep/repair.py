@@ -1,5 +1,6 @@
 """Set wrong poses of a map right, or drop the images."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from slimsfm.errors import MapError
@@ -11,6 +12,7 @@ from slimsfm.progress import ProgressBar, silent, single_step
 from slimsfm.upkeep.checking import check_is_full, matches_of, wrong_poses
 from slimsfm.upkeep.extension import NewImage, extend_map
 from slimsfm.upkeep.findings import MapCheck, WrongPose, listed
+from slimsfm.upkeep.origins import focal_origins
 
 _SETS = 2  # of references that must agree on a pose before an image is set there
 _MAX_ERROR = 0.05  # predicted relative corner error of such a pose
@@ -61,7 +63,8 @@ def repair(map: Map, found: MapCheck, *, progress: ProgressBar = silent) -> Repa
         raise MapError("no two images have poses that agree; build the map again")
     matches = matches_of(map, progress)
     kept = keep_images(replace(map, matches=matches), right, min_track_length=2)
-    sure = [one for one in found.wrong if _is_sure(one)]
+    misplaced = {one.name for one in found.misplaced}
+    sure = [one for one in found.wrong if _is_sure(one, misplaced)]
     with single_step(progress, "register images again"):
         extended = _registered(map, kept, sure, matches) if sure else kept
     seen, still = extended.observations, _still_wrong(extended, sure, progress)
@@ -80,8 +83,10 @@ def _still_wrong(extended: Map, sure: list[WrongPose], progress: ProgressBar) ->
     return {one.name for one in wrong_poses(extended, progress)} if sure else set()
 
 
-def _is_sure(one: WrongPose) -> bool:
-    return len(one.sets) >= _SETS and one.predicted_error <= _MAX_ERROR
+def _is_sure(one: WrongPose, misplaced: Collection[str]) -> bool:
+    """Whether enough sets of references say well enough where an image stands, none of them misplaced."""
+    is_reliable = not any(set(some) & set(misplaced) for some in one.sets)
+    return is_reliable and len(one.sets) >= _SETS and one.predicted_error <= _MAX_ERROR
 
 
 def _registered(map: Map, kept: Map, sure: list[WrongPose], matches: Matches) -> Map:
@@ -109,6 +114,6 @@ def _described(made: Map, map: Map, moved: tuple[str, ...], dropped: tuple[str, 
     before = map.info.quality
     quality = measure(made.model, made.matches, [*made.images, *dropped])
     if before is not None:
-        quality = replace(quality, given=before.given).with_origins(before.focal_origins)
+        quality = replace(quality, given=before.given).with_origins(focal_origins(map))
     wrong = tuple(name for name in map.info.wrong_poses if name not in (*moved, *dropped))
     return replace(made, info=replace(map.info, notes=tuple(notes), quality=quality, wrong_poses=wrong))

@@ -114,11 +114,15 @@ class Court:
         )
 
     def reconsider(self, verdicts: Verdicts, unreliable: Collection[int]) -> Verdicts:
-        """Try the images with wrong poses again, by images that are neither wrong nor unreliable."""
+        """Try the images with wrong poses again, by images that are neither wrong nor unreliable.
+
+        Those that none of these localizes stay wrong, as they were tried before.
+        """
         self._witnesses.suspect({*verdicts.wrong, *unreliable})
         trials = list(verdicts.trials)
         for i in verdicts.wrong:
-            trials[i] = self._judge(self._hear(i))
+            again = self._judge(self._hear(i))
+            trials[i] = again if again.testimonies else trials[i]
         wrong = tuple(i for i in verdicts.wrong if trials[i].is_contradicted)
         return Verdicts(wrong=wrong, trials=tuple(trials), usual=verdicts.usual)
 
