@@ -1,7 +1,5 @@
 """How exact a map from known poses is: localize every third photo in a map of the others.
 
-In the last line the map is built from the photos alone, and then aligned to the known positions.
-
 The folder has a `transforms.json` and the photos that it names. Sorted by name, every third photo, starting
 with the first, is a query. Errors are distances to the given poses, in the unit of the file.
 
@@ -21,11 +19,6 @@ from slimsfm.geometry import rotation_error_deg
 from slimsfm.image_files import find_images
 from slimsfm.mapping.known_poses import read_given
 from slimsfm.mapping.known_poses.matching import PhotosToPose, match_photos
-from slimsfm.upkeep.align import Positions, align
-from slimsfm.upkeep.positions import KnownPositions
-
-WAYS = "as they are", "refined", "not given"
-"""What is done with the known poses."""
 
 
 def center(pose: pycolmap.Rigid3d) -> np.ndarray:
@@ -43,19 +36,15 @@ def split(folder: Path, names: list[str], place: Path) -> tuple[Path, Path]:
     return folders
 
 
-def measure(folder: Path, place: Path, workers: int, way: str) -> str:
+def measure(folder: Path, place: Path, workers: int, *, refine: bool) -> str:
     """Build the map, localize the queries, and give a row of the table."""
     names = sorted(find_images(folder).names)
     given = read_given(folder)
     keys = match_photos(given, PhotosToPose(folder=folder, names=names, seconds={}))
     references, queries = split(folder, sorted(keys), place)
     executor = None if workers == 1 else lambda: processes(workers)
-    poses = None if way == WAYS[-1] else folder
-    inputs = InputOptions(poses=poses, refine=way == WAYS[1])
+    inputs = InputOptions(poses=folder, refine=refine)
     made = build_map(references, inputs=inputs, open_executor=executor)
-    if poses is None:
-        there = {name: center(given.cam_from_world[keys[name]]) for name in made.images}
-        made = align(made, Positions(known=KnownPositions(by_name=there))).map
     found = localize_images(Localizer(made), queries, workers=workers)
     errors = []
     for name, one in found.items():
@@ -69,13 +58,13 @@ def measure(folder: Path, place: Path, workers: int, way: str) -> str:
     within = np.mean((moved <= 0.05) & (turned <= 5))
     notes = next((note for note in made.info.notes if note.startswith("poses adjusted")), "")
     return (
-        f"| {way} | {made.info.unit} | {len(errors)} | "
+        f"| {'refined' if refine else 'as they are'} | {made.info.unit} | {len(errors)} | "
         f"{np.median(moved):.4f} | {np.median(turned):.2f}° | {within:.1%} | {notes} |"
     )
 
 
 def main() -> None:
-    """Measure a folder in all ways."""
+    """Measure a folder, without and with refinement."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -84,9 +73,9 @@ def main() -> None:
     options = parser.parse_args()
     print("| poses | unit | queries | median distance | median angle | within 0.05 and 5° | |")
     print("|---|---|---|---|---|---|---|")
-    for way in WAYS:
+    for refine in (False, True):
         with TemporaryDirectory() as place:
-            print(measure(options.folder, Path(place), options.workers, way), flush=True)
+            print(measure(options.folder, Path(place), options.workers, refine=refine), flush=True)
 
 
 if __name__ == "__main__":
