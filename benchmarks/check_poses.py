@@ -7,7 +7,8 @@ Makes poses of right maps wrong: one image, 5 % and 10 %; a third each are moved
 or stand at the twin position of a symmetric object. Points are triangulated again with the wrong poses, or
 stay as they were. Prints what is found, and the share of held-out queries within 0.1 of the diagonal on the
 right, the wrong and the repaired map. With `--rooms`, maps rendered rooms with patterned carpet by plain
-pycolmap, and prints which images are really wrong and which are found.
+pycolmap, and prints which images are really wrong, which are found, and which would be blamed if all stood
+where they really do.
 """
 
 import argparse
@@ -18,13 +19,13 @@ from time import process_time
 import numpy as np
 
 from benchmark_scenes import Scene, scenes
-from plain_rooms import ROOMS, plain_room
+from plain_rooms import ROOMS, plain_room, really_wrong
 from posed_scenes import posed
 from slimsfm.evaluation.results import evaluate
 from slimsfm.mapping import Map, read_map
 from slimsfm.upkeep.checking import check
 from slimsfm.upkeep.repair import repair
-from wrong_maps import made_wrong
+from wrong_maps import made_wrong, retriangulated
 
 
 def rows(scene: Scene, shares: list[float], seeds: int) -> Iterator[list]:
@@ -90,9 +91,11 @@ def print_room(name: str, output: Path) -> None:
     blamed = sorted(names - room.wrong)
     print(f"{name}: {len(room.map.images)} images, really wrong: {', '.join(sorted(room.wrong)) or 'none'}")
     print(f"found {len(names & room.wrong)} of {len(room.wrong)}, blamed: {', '.join(blamed) or 'none'}")
+    right = check(retriangulated(room.map, room.true_poses)).wrong_names
+    print(f"with the true poses: {len(right)} blamed ({', '.join(right) or 'none'})")
     repaired = repair(room.map, found).map
-    left = room.wrong & repaired.images.keys()
-    print(f"after the repair: {len(repaired.images)} images, of which {len(left)} were wrong")
+    left = really_wrong(repaired, room.take)
+    print(f"after the repair: {len(repaired.images)} images, of which {len(left)} are wrong")
     for one in (
         *found.wrong,
         *found.misplaced,

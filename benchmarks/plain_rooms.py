@@ -33,6 +33,14 @@ class PlainRoom:
     wrong: frozenset[str]
     """Images that are really wrong: outside of the largest set that one similarity aligns with the truth."""
 
+    take: Take
+    """The rendered photos with their true poses."""
+
+    @property
+    def true_poses(self) -> dict[str, pycolmap.Rigid3d]:
+        """Where the images of the map really stand."""
+        return {name: self.take.cam_from_object[int(name[5:8])] for name in self.map.images}
+
 
 def plain_room(name: str, output: Path) -> PlainRoom:
     """Render and map a room; existing files in the output folder are reused."""
@@ -45,7 +53,7 @@ def plain_room(name: str, output: Path) -> PlainRoom:
     if not path.exists():
         write_map(_mapped(folder, output / name), path)
     made = read_map(path)
-    return PlainRoom(map=made, wrong=really_wrong(made, take))
+    return PlainRoom(map=made, wrong=really_wrong(made, take), take=take)
 
 
 def _mapped(images: Path, folder: Path) -> Map:

@@ -3,7 +3,8 @@
 Where Structure from Motion lays look-alike parts over each other, the images there confirm each other by what
 looks alike. What does not look alike gives them away: of the points that the images next to them see, they
 match few, and many of their matches with these images contradict the map. An image of a right map may also
-match few points, because something hides them, but its matches agree.
+match few points, because something hides them, but its matches agree. Only images are in doubt that pairs
+which are hard to doubt (`mapping.support`) contradict, or that such pairs join with these.
 """
 
 from collections.abc import Collection, Mapping
@@ -17,7 +18,7 @@ from scipy.spatial import KDTree
 from slimsfm.arrays import IndexPairs, Mask
 from slimsfm.mapping.map import Map
 from slimsfm.mapping.pairs import Matches
-from slimsfm.mapping.support import MIN_AGREEING, Pair
+from slimsfm.mapping.support import MIN_AGREEING, Pair, trusted_pairs
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.findings import Misplaced
 from slimsfm.upkeep.missed_points import points_in_view
@@ -74,7 +75,7 @@ def find_misplaced(
     wrong: Collection[str],
     progress: ProgressBar = silent,
 ) -> tuple[Misplaced, ...]:
-    """Find images that match fewer than 30 % of what they should see, and whose matches contradict the map.
+    """Find images in doubt that match fewer than 30 % of what they should see, and contradict the map.
 
     The worst image is taken out first, and the others are compared without it. Then parts that confirm
     themselves are compared with the rest: those that match fewer than 20 % of what they should see of it, and
@@ -88,9 +89,12 @@ def find_misplaced(
         progress: Progress callback.
     """
     names = list(map.images)
-    pairs = _pairs(map, matches, agreeing, progress)
     right = np.array([name not in wrong for name in names])
-    kept = _without_parts(pairs, _without_images(pairs, right))
+    doubted = _doubted(names, matches, agreeing, wrong)
+    if not doubted.any():
+        return ()
+    pairs = _pairs(map, matches, agreeing, progress)
+    kept = _without_parts(pairs, _without_images(pairs, right, doubted))
     expected, seen, matched, agreed = pairs.sums(kept)
     return tuple(
         Misplaced(
@@ -102,6 +106,26 @@ def find_misplaced(
         )
         for i in np.flatnonzero(right & ~kept).tolist()
     )
+
+
+def _doubted(
+    names: list[str], matches: Matches, agreeing: Mapping[Pair, float], wrong: Collection[str]
+) -> Mask:
+    """Which images trusted pairs that agree join with one that a trusted pair contradicts.
+
+    In a right map of what looks alike, many pairs contradict the map, but not those that are hard to doubt.
+    """
+    graph, broken = nx.Graph(), set()
+    graph.add_nodes_from(names)
+    for pair in sorted(trusted_pairs(matches, names)):
+        if set(pair) & set(wrong):
+            continue
+        if agreeing.get(pair, 1.0) >= MIN_AGREEING:
+            graph.add_edge(*pair)
+        else:
+            broken.update(pair)
+    doubted = {name for part in nx.connected_components(graph) if part & broken for name in part}
+    return np.array([name in doubted for name in names])
 
 
 def _pairs(map: Map, matches: Matches, agreeing: Mapping[Pair, float], progress: ProgressBar) -> _Pairs:
@@ -127,12 +151,12 @@ def _pairs(map: Map, matches: Matches, agreeing: Mapping[Pair, float], progress:
     )
 
 
-def _without_images(pairs: _Pairs, right: Mask) -> Mask:
-    """Which images are left when the worst one is taken out until none is misplaced."""
+def _without_images(pairs: _Pairs, right: Mask, doubted: Mask) -> Mask:
+    """Which images are left when the worst one in doubt is taken out until none is misplaced."""
     kept = right.copy()
     while True:
         expected, seen, matched, agreeing = pairs.sums(kept)
-        is_out = kept & (seen < _MATCHED * expected) & (agreeing < _AGREEING * matched)
+        is_out = kept & doubted & (seen < _MATCHED * expected) & (agreeing < _AGREEING * matched)
         if not is_out.any():
             return kept
         shares = np.where(is_out, seen / np.maximum(expected, 1), np.inf)
@@ -151,8 +175,8 @@ def _without_parts(pairs: _Pairs, kept: Mask) -> Mask:
         shares = np.where(agreeing < MIN_AGREEING * matched, seen / np.maximum(expected, 1), np.inf)
         if not len(shares) or shares.min() >= _PART_MATCHED:
             return left
-        top = tree.order[int(np.argmin(shares))]
-        left[sorted(tree.smaller_side(top))] = False
+        part = tree.smaller_side(tree.order[int(np.argmin(shares))])
+        left[sorted(part)] = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
