@@ -79,7 +79,8 @@ def find_misplaced(
 
     The worst image is taken out first, and the others are compared without it. Then parts that confirm
     themselves are compared with the rest: those that match fewer than 20 % of what they should see of it, and
-    of whose matches with it most contradict the map, are misplaced too.
+    of whose matches with it most contradict the map, are misplaced too. In the end, images come back that
+    what is left confirms.
 
     Args:
         map: A full map.
@@ -96,6 +97,7 @@ def find_misplaced(
     pairs = _pairs(map, matches, agreeing, progress)
     kept = _without_parts(pairs, _without_images(pairs, right, doubted))
     expected, seen, matched, agreed = pairs.sums(kept)
+    kept |= (seen > _MATCHED * expected) & (agreed > MIN_AGREEING * matched)
     return tuple(
         Misplaced(
             name=names[i],
