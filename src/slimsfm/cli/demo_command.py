@@ -18,7 +18,7 @@ from slimsfm.files.space import check_place
 from slimsfm.progress import shown
 from slimsfm.tracking.video import check_format
 
-_OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=32, query_frames=12)
+_OBJECTS = SynthesisOptions(objects=("printed_box", "boulder"), mapping_frames=28, query_frames=9)
 
 
 def demo(
