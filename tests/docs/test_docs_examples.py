@@ -16,7 +16,7 @@ PAGES = ["index.md", *(f"how-to/{path.name}" for path in sorted((DOCS / "how-to"
 NOT_TYPED = (
     "pip install ",  # the tests run with the installed packages
     "ffmpeg ",  # the Python lines next to it do the same
-    "slimsfm demo",  # it has its own test
+    "slimsfm demo",  # takes minutes, and is one of the two commands that README promises
     "slimsfm serve ",  # runs until it is stopped
     "slimsfm view ",  # runs until it is stopped
     "slimsfm align map -o metric --tag-size",  # no tag is in these photos; tests/upkeep has some
