@@ -8,7 +8,7 @@ from slimsfm.progress import silent
 from slimsfm.upkeep import misplaced as module
 from slimsfm.upkeep.checking import check, wrong_poses
 from slimsfm.upkeep.findings import Misplaced
-from slimsfm.upkeep.misplaced import find_misplaced
+from slimsfm.upkeep.misplaced import Surroundings
 from slimsfm.upkeep.repair import repair
 from wrong_poses import laid_over, matched_map, turned
 
@@ -27,7 +27,7 @@ def folded(right):
 
 
 def misplaced(map_, wrong=()):
-    found = find_misplaced(map_, map_.matches, agreement(map_.images, map_.matches), wrong)
+    found = Surroundings(map_, map_.matches, agreement(map_.images, map_.matches)).misplaced(wrong)
     return tuple(one.name for one in found)
 
 

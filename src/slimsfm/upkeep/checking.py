@@ -15,7 +15,7 @@ from slimsfm.mapping.support import MIN_AGREEING, Pair, agreement, trusted_pairs
 from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.findings import ContradictedPair, MapCheck, Misplaced, Unlocalized, WrongPose
 from slimsfm.upkeep.likeness import find_blurred, find_duplicates
-from slimsfm.upkeep.misplaced import find_misplaced
+from slimsfm.upkeep.misplaced import Surroundings
 from slimsfm.upkeep.threads import find_threads
 from slimsfm.upkeep.verdicts import Court, Trial, Verdicts
 from slimsfm.upkeep.witnesses import Witnesses
@@ -94,11 +94,11 @@ def _decide(
     verdicts = court.decide([one.part for one in threads if one.contradicted])
     if _has_known_poses(map):
         return verdicts, ()
-    names = witnesses.names
-    misplaced = find_misplaced(map, matches, agreeing, {names[i] for i in verdicts.wrong}, progress)
+    names, surroundings = witnesses.names, Surroundings(map, matches, agreeing, progress)
+    misplaced = surroundings.misplaced({names[i] for i in verdicts.wrong})
     if misplaced and verdicts.wrong:
         verdicts = court.reconsider(verdicts, [names.index(one.name) for one in misplaced])
-        misplaced = find_misplaced(map, matches, agreeing, {names[i] for i in verdicts.wrong}, progress)
+        misplaced = surroundings.misplaced({names[i] for i in verdicts.wrong})
     return verdicts, misplaced
 
 

@@ -24,7 +24,7 @@ from slimsfm.progress import ProgressBar, silent
 from slimsfm.upkeep.between_maps import MapSimilarity, similarity_between
 from slimsfm.upkeep.extension import JoinedMapping, NewImage, add_images
 from slimsfm.upkeep.joining import add_points, same_points
-from slimsfm.upkeep.origins import focal_origins
+from slimsfm.upkeep.origins import focal_origins, over_cameras
 from slimsfm.upkeep.refinement import Movement, refined
 from slimsfm.upkeep.transform import transformed
 
@@ -219,12 +219,7 @@ def _focal_origins(merged: Map, target: Map, source: Map, names: Mapping[str, st
     others = {names[name]: origin for name, origin in others.items() if name in names}
     if "given" not in kept.values():
         others = {name: "model" if origin == "given" else origin for name, origin in others.items()}
-    of_camera = {merged.images[name].camera_id: origin for name, origin in {**others, **kept}.items()}
-    return {
-        name: of_camera[image.camera_id]
-        for name, image in merged.images.items()
-        if image.camera_id in of_camera
-    }
+    return over_cameras(merged, {**others, **kept})
 
 
 def _renamed(source: Map, names: Mapping[str, str]) -> dict[tuple[str, str], IndexPairs]:

@@ -9,6 +9,7 @@ which are hard to doubt (`mapping.support`) contradict, or that such pairs join 
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import networkx as nx
 import numpy as np
@@ -68,46 +69,54 @@ class _Pairs:
         return found[0], found[1], found[2], found[3]
 
 
-def find_misplaced(
-    map: Map,
-    matches: Matches,
-    agreeing: Mapping[Pair, float],
-    wrong: Collection[str],
-    progress: ProgressBar = silent,
-) -> tuple[Misplaced, ...]:
-    """Find images in doubt that match fewer than 30 % of what they should see, and contradict the map.
-
-    The worst image is taken out first, and the others are compared without it. Then parts that confirm
-    themselves are compared with the rest: those that match fewer than 20 % of what they should see of it, and
-    of whose matches with it most contradict the map, are misplaced too. In the end, images come back that
-    what is left confirms.
+class Surroundings:
+    """What the images of a map should see of those around them, and what they match of it.
 
     Args:
         map: A full map.
         matches: Verified matches.
         agreeing: Share of the matches of each pair that agree with the map.
-        wrong: Images that are left out, because their poses are known to be wrong.
         progress: Progress callback.
     """
-    names = list(map.images)
-    right = np.array([name not in wrong for name in names])
-    doubted = _doubted(names, matches, agreeing, wrong)
-    if not doubted.any():
-        return ()
-    pairs = _pairs(map, matches, agreeing, progress)
-    kept = _without_parts(pairs, _without_images(pairs, right, doubted))
-    expected, seen, matched, agreed = pairs.sums(kept)
-    kept |= (seen > _MATCHED * expected) & (agreed > MIN_AGREEING * matched)
-    return tuple(
-        Misplaced(
-            name=names[i],
-            expected=int(expected[i]),
-            seen=int(seen[i]),
-            matches=int(matched[i]),
-            agreeing=float(agreed[i] / max(matched[i], 1)),
+
+    def __init__(
+        self, map: Map, matches: Matches, agreeing: Mapping[Pair, float], progress: ProgressBar = silent
+    ) -> None:
+        self._map, self._matches, self._agreeing, self._progress = map, matches, agreeing, progress
+
+    @cached_property
+    def _pairs(self) -> _Pairs:
+        return _pairs(self._map, self._matches, self._agreeing, self._progress)
+
+    def misplaced(self, wrong: Collection[str]) -> tuple[Misplaced, ...]:
+        """Find images in doubt that match fewer than 30 % of what they should see, and contradict the map.
+
+        The worst image is taken out first, and the others are compared without it. Then parts that confirm
+        themselves are compared with the rest: those that match fewer than 20 % of what they should see of it,
+        and of whose matches with it most contradict the map, are misplaced too. In the end, images come back
+        that what is left confirms.
+
+        Args:
+            wrong: Images that are left out, because their poses are known to be wrong.
+        """
+        names = list(self._map.images)
+        right = np.array([name not in wrong for name in names])
+        doubted = _doubted(names, self._matches, self._agreeing, wrong)
+        if not doubted.any():
+            return ()
+        kept = _without_parts(self._pairs, _without_images(self._pairs, right, doubted))
+        expected, seen, matched, agreed = self._pairs.sums(kept)
+        kept |= (seen > _MATCHED * expected) & (agreed > MIN_AGREEING * matched)
+        return tuple(
+            Misplaced(
+                name=names[i],
+                expected=int(expected[i]),
+                seen=int(seen[i]),
+                matches=int(matched[i]),
+                agreeing=float(agreed[i] / max(matched[i], 1)),
+            )
+            for i in np.flatnonzero(right & ~kept).tolist()
         )
-        for i in np.flatnonzero(right & ~kept).tolist()
-    )
 
 
 def _doubted(
@@ -219,12 +228,10 @@ def _across(pairs: _Pairs, kept: Mask, tree: _Tree) -> Float64[np.ndarray, "edge
     inside = kept[pairs.images].all(axis=1) & (pairs.images[:, 0] < pairs.images[:, 1])
     values = np.stack([weight[inside] for weight in pairs.weights], axis=1)
     row = {(a, b): place for place, (a, b) in enumerate(pairs.images[inside].tolist())}
-    for root in [node for node, degree in tree.graph.in_degree() if not degree]:
-        below = {root, *nx.descendants(tree.graph, root)}
-        own = [pair for pair in row if pair[0] in below]
-        found = nx.tree_all_pairs_lowest_common_ancestor(tree.graph, root, own)
-        for (a, b), top in found:
-            totals[top] -= 2 * values[row[(a, b) if (a, b) in row else (b, a)]]
+    joined, top_of_all = tree.graph.copy(), -1
+    joined.add_edges_from((top_of_all, node) for node, degree in tree.graph.in_degree() if not degree)
+    for (a, b), top in nx.tree_all_pairs_lowest_common_ancestor(joined, top_of_all, row) if row else ():
+        totals[top] -= 2 * values[row[min(a, b), max(a, b)]]
     for below in reversed(tree.order):
         (above,) = tree.graph.predecessors(below)
         totals[above] += totals[below]

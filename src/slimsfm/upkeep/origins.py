@@ -1,6 +1,7 @@
 """Where a map and its focal lengths come from, after changes."""
 
 import re
+from collections.abc import Mapping
 
 from slimsfm.mapping.map import Map
 
@@ -16,8 +17,12 @@ def with_count(origin: str, count: int, what: str) -> str:
 
 def focal_origins(map: Map) -> dict[str, str]:
     """First guess of the focal length of each image, as far as the map says so of its camera."""
-    known = map.info.quality.focal_origins if map.info.quality else {}
-    of_camera = {map.images[name].camera_id: origin for name, origin in known.items() if name in map.images}
+    return over_cameras(map, map.info.quality.focal_origins if map.info.quality else {})
+
+
+def over_cameras(map: Map, origins: Mapping[str, str]) -> dict[str, str]:
+    """The origins that are given for some images, for all images of their cameras; later ones count."""
+    of_camera = {map.images[name].camera_id: origin for name, origin in origins.items() if name in map.images}
     return {
         name: of_camera[image.camera_id] for name, image in map.images.items() if image.camera_id in of_camera
     }
